@@ -82,16 +82,14 @@ def save_meta(run: RunPaths, meta: CheckpointMeta) -> Path:
     return run.checkpoint(meta.env_steps)
 
 
-def make_launch(
-    run: RunPaths, modes: Sequence[str], plan: Plan, *, compile_once: bool = True, **limits: float
-) -> Launch:
+def make_launch(run: RunPaths, modes: Sequence[str], plan: Plan, **limits: float) -> Launch:
     """A job whose GMI i runs `fake_gmi` with `modes[i]`."""
     limits_s = {"start": 90.0, "stall": 90.0, "stop": 90.0, "grace": 2.0} | limits
     return Launch(
         plan=plan,
         machine=machine(0),
         run=run,
-        kind=JobKind("fake_gmi", compile_once=compile_once),
+        kind=JobKind("fake_gmi"),
         timeouts=Timeouts(
             start_timeout_s=limits_s["start"],
             stall_timeout_s=limits_s["stall"],

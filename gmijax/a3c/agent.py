@@ -99,7 +99,7 @@ class Agent:
             *(self.env, self._learner.networks, num_steps, num_pieces, weights, env_state),
             stays=self.sender.on_device,
         )
-        compile_s = time.monotonic() - started
+        compile_s = time.monotonic() - started - self.link.start_s["waiting"]
         self.link.beat("ready", 0)
         self._wait_for_start()
         started = time.monotonic()

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from gmijax.a3c.targets import Unrolls
+from gmijax.compile_once import compile_once
 from gmijax.devices import host_sharding
 from gmijax.learning.learner import ActingWeights, state_values
 from gmijax.learning.normalize import normalize
@@ -98,8 +99,8 @@ class UnrollPrograms:
         where = host_sharding()
         unrolls: Any = None if stays else where
         joining = jax.jit(join, out_shardings=(unrolls, where) if where else None)
-        self._join: Any = joining.lower([lowered.out_info[1:]] * num_pieces).compile()
-        self._piece: Any = lowered.compile()
+        self._join: Any = compile_once(joining.lower([lowered.out_info[1:]] * num_pieces))
+        self._piece: Any = compile_once(lowered)
 
     def piece(
         self, weights: ActingWeights, env_state: BatchState

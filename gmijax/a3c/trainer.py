@@ -86,10 +86,6 @@ class Trainer:
         self.link.beat("compiling", 0)
         started = time.monotonic()
         leads = self.comm.rank == 0
-        if not leads:
-            # The leader compiles first, the others take its programs from the cache: those that
-            # each of them would tune could differ in the last bit.
-            self.comm.all_gather(np.zeros(1, np.float32))
         # The same key as synchronous training uses: the same first policy.
         state, self._env_steps = first_state(
             init_learner, self._learner, self.env.spec.obs_size, self.config
@@ -97,11 +93,9 @@ class Trainer:
         self._version = int(state.iteration)
         self._update.trace((), state, self._example())
         self._update.compile()
-        if leads:
-            self.comm.all_gather(np.zeros(1, np.float32))
         pack = jax.jit(lambda state: pack_weights(acting_weights(self._learner, state)))
         first = np.asarray(pack(state))
-        compile_s = time.monotonic() - started
+        compile_s = time.monotonic() - started - self.link.start_s["waiting"]
         self.link.beat("ready", 0)
         # And so all trainers have compiled.
         require_equal(self.comm, self.link.gmi, state.params, self._env_steps)

@@ -2,7 +2,8 @@
 
 A skeleton is a pickle in which arrays stand as references. So whatever can be pickled can hold
 arrays (dicts, lists, tuples, NamedTuples, dataclasses, what others build of them), arrays travel
-as raw bytes, and a process that has no use for jax need not load it.
+as raw bytes, and a process that has no use for jax need not load it. `cloudpickle` knows objects
+of classes of a script or a notebook, which no other process finds by name.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import cloudpickle
 import numpy as np
 import numpy.typing as npt
 
@@ -36,7 +38,7 @@ def flatten(
       The skeleton and the arrays, C-contiguous, perhaps views of what was flattened.
 
     Raises:
-      TypeError, AttributeError, pickle.PicklingError: something cannot be pickled, e.g. a lambda.
+      TypeError, pickle.PicklingError: something cannot be pickled, e.g. a lock.
     """
     file = io.BytesIO()
     pickler = _Pickler(file, scalars, put)
@@ -76,7 +78,7 @@ def on_host(value: Any) -> npt.NDArray[Any] | None:
     return None
 
 
-class _Pickler(pickle.Pickler):
+class _Pickler(cloudpickle.Pickler):
     def __init__(self, file: io.BytesIO, scalars: bool, put: Callable[[Any], Any]) -> None:
         super().__init__(file, protocol=5)
         self.arrays: list[npt.NDArray[Any]] = []

@@ -103,9 +103,9 @@ class ClusterJob:
             if node.lost is not None:
                 raise GmiFailed(gmi, node.lost)
 
-        def start(gmi: int, waits: bool) -> WatchedGmi:
+        def start(gmi: int) -> WatchedGmi:
             node = self._joined[launch.plan.layout.node_of(gmi)].remote
-            return node.start(gmi, waits, launch.run.gmi(gmi))
+            return node.start(gmi, launch.run.gmi(gmi))
 
         backend = BackendOfNodes(launch, self._joined)
         supervisor = Supervisor(launch, backend, start=start)

@@ -15,6 +15,7 @@ import socket
 import struct
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
@@ -50,26 +51,38 @@ ON_GPUS: Final = (
 )
 """The same for nodes whose GPUs are used; the controller may be on a machine without any."""
 
-Order = Literal["let_go", "ask_to_stop", "order_end", "end_as_done", "kill"]
+Order = Literal["ask_to_stop", "order_end", "end_as_done", "kill"]
 """Methods of a `GmiProcess` that the controller may call."""
 
 _SIOCGIFADDR: Final = 0x8915
 
 
 class Facts(NamedTuple):
-    """What a node is."""
+    """What a node is.
 
-    address: str  # IP address for the exchange with other nodes.
+    Attributes:
+      address: IP address for the exchange with other nodes.
+      machine: what it has.
+      versions: of all that computes, by package; see `own_versions`.
+    """
+
+    address: str
     machine: Machine
     versions: dict[str, str | None]
 
 
 class Opened(NamedTuple):
-    """What a node has for its GMIs: where they will listen, and daemons of its GPUs."""
+    """What a node has for its GMIs: where they will listen, and daemons of its GPUs.
+
+    Attributes:
+      leader: address and port of its leading GMI.
+      calls: see `NodeAddresses`.
+      daemons: see `Machine`.
+    """
 
     leader: tuple[str, int]
-    calls: dict[tuple[int, int], str]  # See `NodeAddresses`.
-    daemons: dict[str, Path]  # See `Machine`.
+    calls: dict[tuple[int, int], str]
+    daemons: dict[str, Path]
 
 
 class Seen(NamedTuple):
@@ -198,14 +211,13 @@ class TrainingNode(Node):
             self._blocks[ENV_NODES_FD] = nodes.to_file()
             self._held.callback(os.close, self._blocks[ENV_NODES_FD])
         self._num_gmis = len(self._launch.plan.layout.gmis_of_node[nodes.node])
-        launch, backend, blocks = self._launch, self._backend, self._blocks
-        self._start = lambda gmi, waits: start_gmi(launch, backend, blocks, gmi, waits)
+        self._start = partial(start_gmi, self._launch, self._backend, self._blocks)
 
-    def start(self, gmi: int, waits: bool) -> int | str:
+    def start(self, gmi: int) -> int | str:
         """Starts a GMI; its process, or why there is none."""
         assert self._start is not None
         try:
-            process = self._start(gmi, waits)
+            process = self._start(gmi)
         except GmiFailed as error:
             return error.reason
         assert isinstance(process, GmiProcess)

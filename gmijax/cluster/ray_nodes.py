@@ -17,7 +17,7 @@ from gmijax.clock import running_s
 from gmijax.cluster.node import Facts, Node
 from gmijax.cluster.remote_gmi import LOST_S, RemoteNode
 from gmijax.config import ClusterConfig
-from gmijax.errors import ConfigError, JobInterrupted, lines_of
+from gmijax.errors import ConfigError, JobInterrupted, NodeLost, lines_of
 from gmijax.machine.processes import ProcessId, identify
 from gmijax.version import __version__
 
@@ -249,7 +249,13 @@ class _RayAnswer:
         return bool(self._ray.wait([self._reference], timeout=0)[0])
 
     def get(self) -> Any:
-        return self._ray.get(self._reference, timeout=LOST_S)
+        errors = self._ray.exceptions
+        try:
+            return self._ray.get(self._reference, timeout=LOST_S)
+        except errors.RayTaskError as error:  # The method that was called has failed.
+            raise error.cause from error
+        except errors.RayError as error:
+            raise NodeLost(lines_of(error)[-1]) from None
 
 
 class _NodeActor:

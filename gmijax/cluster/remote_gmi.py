@@ -9,7 +9,7 @@ from typing import Any, Final, Protocol
 
 from gmijax.clock import running_s
 from gmijax.cluster.node import Seen
-from gmijax.errors import GmiFailed, ReportedError, lines_of
+from gmijax.errors import GmiFailed, NodeLost, ReportedError, lines_of
 from gmijax.runs.folder import GmiPaths
 from gmijax.supervise.watched_gmi import WatchedGmi
 
@@ -28,7 +28,7 @@ class Answer(Protocol):
         ...
 
     def get(self) -> Any:
-        """The answer; raises what Ray raises."""
+        """The answer, or what the method raises; NodeLost if the node is gone."""
         ...
 
 
@@ -58,26 +58,20 @@ class RemoteNode:
         self._asked: Answer | None = None
         self._asked_s = 0.0
 
-    def start(self, gmi: int, waits: bool, paths: GmiPaths) -> RemoteGmi:
+    def start(self, gmi: int, paths: GmiPaths) -> RemoteGmi:
         """Starts a GMI there.
 
         Raises:
           GmiFailed: it cannot be started, or the node is gone.
         """
-        started = self.call("start", gmi, waits)
+        started = self.call("start", gmi)
         if not isinstance(started, int):
             raise GmiFailed(gmi, started or self.lost or "its node does not answer")
-        return RemoteGmi(self, gmi, paths, started, waits=waits)
+        return RemoteGmi(self, gmi, paths, started)
 
     def call(self, method: str, *arguments: Any) -> Any:
-        """What a method returns; None if the node is gone, or while it is being lost."""
-        if self.lost is not None:
-            return None
-        try:
-            return self._ask(method, *arguments).get()
-        except Exception as error:
-            self._lose(error)
-            return None
+        """What a method returns or raises; None if the node is gone, or while it is being lost."""
+        return None if self.lost is not None else self._answer(self._ask(method, *arguments))
 
     def tell(self, method: str, *arguments: Any) -> None:
         """Calls a method without waiting for it; a node does one after the other."""
@@ -93,11 +87,8 @@ class RemoteNode:
         """The newest that its `poll` told of a child; None before the first answer."""
         now_s = running_s()
         if self.lost is None and self._asked is not None and self._asked.is_there():
-            try:
-                self._seen = self._asked.get()
-            except Exception as error:
-                self._lose(error)
-            self._asked = None
+            seen, self._asked = self._answer(self._asked), None
+            self._seen = self._seen if seen is None else seen
         if self.lost is None and self._asked is None:
             self._asked, self._asked_s = self._ask("poll"), now_s
         waited_s = now_s - self._asked_s
@@ -105,6 +96,16 @@ class RemoteNode:
         if self.is_silent and waited_s > LOST_S:
             self._lose(TimeoutError(f"it does not answer for {LOST_S:g} s"))
         return self._seen.get(child)
+
+    def _answer(self, asked: Answer) -> Any:
+        try:
+            return asked.get()
+        except NodeLost as error:
+            self._lose(error)
+            return None
+        except Exception as error:
+            self._lose(error)  # It is not asked any more while the job ends.
+            raise
 
     def _lose(self, error: Exception) -> None:
         self.lost = f"node {self._position} ({self.address}) is gone: {lines_of(error)[-1]}"
@@ -114,10 +115,8 @@ class RemoteNode:
 class RemoteGmi(WatchedGmi):
     """A GMI on another node."""
 
-    def __init__(
-        self, node: RemoteNode, gmi: int, paths: GmiPaths, pid: int, *, waits: bool
-    ) -> None:
-        super().__init__(gmi, paths, pid, waits=waits)
+    def __init__(self, node: RemoteNode, gmi: int, paths: GmiPaths, pid: int) -> None:
+        super().__init__(gmi, paths, pid)
         self._node = node
         self._error: ReportedError | None = None
         self._log_bytes = 0
@@ -171,6 +170,3 @@ class RemoteGmi(WatchedGmi):
 
     def close(self) -> None:
         """Does nothing: the node drops all lifelines when the job is over."""
-
-    def _tell_to_go(self) -> None:
-        self._node.order(self.gmi, "let_go")

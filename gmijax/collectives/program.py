@@ -22,6 +22,7 @@ from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.interface import Step
 from gmijax.collectives.strategies import Stage
 from gmijax.collectives.xla_call import Buffer, register
+from gmijax.compile_once import compile_once
 from gmijax.devices import host_sharding
 from gmijax.errors import CollectiveError
 
@@ -215,7 +216,7 @@ class ProgramStep:
 
     def compile(self) -> None:
         """See `TracedStep`."""
-        self._program = self._program.compile()
+        self._program = compile_once(self._program)
 
     def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
         """See `TracedStep`."""

@@ -41,7 +41,6 @@ class _BestEffortStream:
         return len(text)
 
     def flush(self) -> None:
-        """See `write`."""
         self._try(lambda stream: stream.flush())
 
     def isatty(self) -> bool:

@@ -23,12 +23,19 @@ C = TypeVar("C", TrainConfig, ServeConfig)
 
 
 class Decided(NamedTuple, Generic[C]):
-    """A job that is ready to start."""
+    """A job that is ready to start.
 
-    config: C  # With nothing `auto` in it that GMIs would have to decide.
-    plan: Plan  # Of the job.
-    machine: Machine  # Where it runs.
-    reasons: tuple[str, ...]  # What was decided beside the plan, in words.
+    Attributes:
+      config: with nothing `auto` in it that GMIs would have to decide.
+      plan: of the job.
+      machine: where it runs.
+      reasons: what was decided beside the plan, in words.
+    """
+
+    config: C
+    plan: Plan
+    machine: Machine
+    reasons: tuple[str, ...]
 
 
 def with_task(config: C) -> C:

@@ -119,7 +119,7 @@ class ConsoleProgress:
     @property
     def _has_figures(self) -> bool:
         """Whether it trains; a job that is started again has lines of before."""
-        return bool(self._line) and self._phase not in ("starting", "compiling")
+        return bool(self._line) and self._phase not in ("starting", "waiting", "compiling")
 
     def _waiting(self) -> str:
         """What is done before the first iteration, why, and for how long."""
@@ -135,6 +135,8 @@ class ConsoleProgress:
             if waited_s > 2 * (last_s or _LONG_S):
                 usual += ", longer now"
             return f"compiling: once for each task and size, {usual}"
+        if self._phase == "waiting":
+            return "waiting: another job compiles the same programs"
         if self._phase == "starting":
             return "starting: loading JAX, building the environments"
         return self._phase
@@ -168,6 +170,8 @@ class ConsoleProgress:
 def _phase_of(gmis: Sequence[GmiStatus]) -> str:
     """What the job does: what holds up those of its GMIs that are further."""
     states, early = {gmi.state for gmi in gmis}, {"starting", "waiting"}
+    if states == {"waiting"}:
+        return "waiting"
     if states and states <= early:
         return "starting"
     if states & {*early, "compiling"}:

@@ -41,28 +41,43 @@ _FRAME = re.compile(r'^ +File "(.+)", line (\d+), in (.+)$', re.MULTILINE)
 
 
 class Restart(NamedTuple):
-    """One time that a job was started again, for `summary.json`."""
+    """One time that a job was started again, for `summary.json`.
 
-    time: str  # Of the fault, ISO 8601.
-    gmi: int  # The one that failed first.
-    cause: str  # In one line.
-    iteration: int  # Iterations that it had done.
-    checkpoint: str | None  # Where the job went on from; None: its beginning.
+    Attributes:
+      time: of the fault, ISO 8601.
+      gmi: the one that failed first.
+      cause: in one line.
+      iteration: iterations that it had done.
+      checkpoint: where the job went on from; None: its beginning.
+    """
+
+    time: str
+    gmi: int
+    cause: str
+    iteration: int
+    checkpoint: str | None
 
 
 @dataclass
 class Attempts:
-    """The attempts at one job."""
+    """The attempts at one job.
+
+    Attributes:
+      run: its folder.
+      max_restarts: without a newer checkpoint in between.
+      launch_at: what to start from a checkpoint (None: from the beginning), by number of the
+        attempt; raises ConfigError if nothing can be started any more.
+      say: takes a line for the user.
+      run_attempt: runs an attempt to its end; see `run_gmis`.
+      require_folder: raises what comes before any fault of a GMI: that its folder is gone.
+      restarts: those so far.
+    """
 
     run: RunPaths
-    max_restarts: int  # Without a newer checkpoint in between.
-    # What to start from a checkpoint (None: from the beginning), by number of the attempt;
-    # raises ConfigError if nothing can be started any more.
+    max_restarts: int
     launch_at: Callable[[Path | None, int], Launch]
-    say: Callable[[str], None]  # Takes a line for the user.
-    # Runs an attempt to its end; see `run_gmis`.
+    say: Callable[[str], None]
     run_attempt: Callable[[Launch, OnTick, StopSignals], None] | None = None
-    # Raises what comes before any fault of a GMI: that its folder is gone.
     require_folder: Callable[[], None] = lambda: None
     restarts: list[Restart] = field(default_factory=list)
     _seen_s: float = 0.0

@@ -167,7 +167,6 @@ def measure(
                 run=run,
                 kind=JobKind(
                     "gmijax.workers.reduction_probe",
-                    compile_once=False,
                     shared=lambda _: {block_variable(k): create_exchange for k in numbers},
                 ),
                 timeouts=TIMEOUTS,

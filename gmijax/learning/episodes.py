@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmijax.compile_once import compile_once
 from gmijax.learning.learner import Learner, TrainState, acting_weights
 from gmijax.learning.unroll import act, unroll
 from gmijax.player.outcome import Episodes
@@ -76,7 +77,7 @@ class EpisodeRunner:
     def compile(self) -> None:
         """Compiles what was traced, or takes it from the cache."""
         started = time.monotonic()
-        self._begin, self._chunk = self._begin.compile(), self._chunk.compile()
+        self._begin, self._chunk = compile_once(self._begin), compile_once(self._chunk)
         self._compile_s += time.monotonic() - started
 
     def run(self, state: TrainState, go_on: Callable[[int, bool], bool]) -> Episodes:

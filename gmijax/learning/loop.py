@@ -151,19 +151,19 @@ class TrainingLoop:
         return self._algorithm.begin(self._learner, self._env, envs)
 
     def _compile(self, state: TrainState, memory: Any) -> float:
-        """Makes all programs; returns the seconds for which it was not this GMI's turn."""
+        """Makes all programs; returns the seconds for which others compiled."""
         # Every GMI does that itself, at the same time.
         self._iteration.trace(self._env.model, state, memory)
         if self._meter is not None:
             self._meter.trace(state, self._algorithm.envs(memory))
         if self._evaluator is not None:
             self._evaluator.trace(state)
-        waited_s = self._link.begin_compiling()
+        self._link.begin_compiling()
         for program in (self._iteration, self._meter, self._evaluator):
             if program is not None:
                 program.compile()
         self._link.end_part("compiling")
-        return waited_s
+        return self._link.start_s["waiting"]
 
     def _open_logs(self) -> None:
         steps_at_once = self._steps_per_iteration // self._config.algo.unroll_length

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from gmijax.compile_once import compile_once
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.devices import memory_limit_bytes
 from gmijax.errors import ConfigError
@@ -167,7 +168,8 @@ def begin_episodes(
             f"them and {kept_steps} steps of each, and has {limit_bytes / 2**30:.3g} GiB; allowed "
             f"are less than {int(limit_bytes * num_envs / least_bytes)}"
         )
-    return init(env.model, env_keys(key, first_env, num_envs))
+    starts = env_keys(key, first_env, num_envs)
+    return compile_once(init.lower(env.model, starts))(env.model, starts)
 
 
 def _memory_bytes() -> float | None:

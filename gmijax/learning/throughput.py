@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from gmijax.collectives.interface import Communicator
+from gmijax.compile_once import compile_once
 from gmijax.config import TrainConfig
 from gmijax.learning.learner import Learner, TrainState, acting_weights
 from gmijax.learning.unroll import Drawn, act, unroll
@@ -52,7 +53,7 @@ class ThroughputMeter:
     def compile(self) -> None:
         """Compiles what was traced."""
         for name, program in self._programs.items():
-            self._programs[name] = program.compile()
+            self._programs[name] = compile_once(program)
 
     def measure(
         self, state: TrainState, env_state: BatchState, beat: Callable[[], None]

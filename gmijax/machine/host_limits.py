@@ -40,12 +40,17 @@ for its core longer than it computes, and twice as many would compile at a time.
 
 
 class HostLimits(NamedTuple):
-    """Free resources for the GMIs of a job, None where unknown or unlimited."""
+    """Free resources for the GMIs of a job, None where unknown or unlimited.
 
-    # Of the machine, or of the control group that this process is in.
+    Attributes:
+      memory_mib: of the machine, or of the control group that this process is in.
+      threads: that may still be started.
+      open_files: that this process may still open.
+    """
+
     memory_mib: float | None = None
-    threads: int | None = None  # That may still be started.
-    open_files: int | None = None  # That this process may still open.
+    threads: int | None = None
+    open_files: int | None = None
 
 
 UNKNOWN_HOST: Final = HostLimits()
@@ -239,6 +244,15 @@ def _number(folder: Path, names: Sequence[str]) -> int | None:
         with suppress(OSError, ValueError):
             return int((folder / name).read_text())
     return None
+
+
+def _cached_bytes(folder: Path) -> int:
+    """Cached files of a group and those in it; version 1 counts these as `total_`."""
+    with suppress(OSError, ValueError):
+        counts = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        names = ("active_file", "inactive_file")
+        return sum(int(counts.get(f"total_{name}", counts.get(name, 0))) for name in names)
+    return 0
 
 
 def _least(*values: N | None) -> N | None:

@@ -38,25 +38,34 @@ _OTHERS = {"kfd": "a GPU for ROCm", "accel[0-9]*": "a TPU"}
 
 @dataclass(frozen=True)
 class Machine:
-    """Resources that a job may use here."""
+    """Resources that a job may use here.
 
-    gpus: tuple[Gpu, ...]  # GPUs that the job may use, in order of preference.
-    # Ids of the CPU cores that a job may use: those that this process may run on, no more than its
-    # control group gets time for.
+    Attributes:
+      gpus: GPUs that the job may use, in order of preference.
+      cpu_cores: ids of the CPU cores that a job may use: those that this process may run on, no
+        more than its control group gets time for.
+      mps_control: program of the MPS daemon, None where it is not installed.
+      driver_version: of the NVIDIA driver, None without one.
+      operator_daemon: pipe directory of a running MPS daemon that somebody else started.
+      daemons: the same for a job of a sweep, by UUID of the GPU or MIG instance.
+      host: what is left of memory, threads and open files.
+      gpu_problem: why there are no GPUs although NVIDIA's driver is there; None where it works,
+        there is none, or the user hides all GPUs.
+      selection_problem: what in `CUDA_VISIBLE_DEVICES` names no GPU of this machine; None where
+        all of it does.
+      warnings: what is here and is not used or cannot be, one sentence each.
+    """
+
+    gpus: tuple[Gpu, ...]
     cpu_cores: tuple[int, ...]
-    mps_control: Path | None = None  # Program of the MPS daemon, None where it is not installed.
-    driver_version: str | None = None  # Of the NVIDIA driver, None without one.
-    # Pipe directory of a running MPS daemon that somebody else started.
+    mps_control: Path | None = None
+    driver_version: str | None = None
     operator_daemon: Path | None = None
-    # The same for a job of a sweep, by UUID of the GPU or MIG instance.
     daemons: Mapping[str, Path] = field(default_factory=dict)
-    host: HostLimits = UNKNOWN_HOST  # What is left of memory, threads and open files.
-    # Why there are no GPUs although NVIDIA's driver is there; None where it works, there is none,
-    # or the user hides all GPUs.
+    host: HostLimits = UNKNOWN_HOST
     gpu_problem: str | None = None
-    # What in `CUDA_VISIBLE_DEVICES` names no GPU of this machine; None where all of it does.
     selection_problem: str | None = None
-    warnings: tuple[str, ...] = ()  # What is here and is not used or cannot be, one sentence each.
+    warnings: tuple[str, ...] = ()
 
     def daemon_of(self, device: str) -> Path | None:
         """Pipe directory of the daemon that runs for a device, None where a job starts its own."""

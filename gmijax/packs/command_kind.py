@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -25,14 +26,12 @@ from gmijax.packs.progress import ProgressReader, own_patterns
 from gmijax.packs.template import fill
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.runs.history import copy_history
+from gmijax.supervise.start_gmi import program_cache
 from gmijax.sweeps.children import Process, Seen
 from gmijax.sweeps.kind import Start
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.places import Place
 from gmijax.sweeps.running import Outcome, Running
-
-_COMPILES_S: Final = 120.0
-"""Longest wait for the first report of the job that compiles first."""
 
 _CLIENT_AFTER_S: Final = 30.0
 """When a job that reports nothing has taken its GPU."""
@@ -73,6 +72,7 @@ class CommandKind:
       settings: of the pack.
       paths: its files.
       cores: CPU cores that the jobs of a GPU share, by site.
+      names: of the machines, by site; None: this one.
       at_once: number of jobs that share a GPU and the cores at a place.
     """
 
@@ -81,12 +81,12 @@ class CommandKind:
         settings: PackConfig,
         paths: PackPaths,
         cores: Sequence[int],
+        names: Sequence[str | None],
         at_once: Callable[[Place], int],
     ) -> None:
         self._settings, self._paths = settings, paths
-        self._cores, self._at_once = cores, at_once
+        self._cores, self._names, self._at_once = cores, names, at_once
         self._own = own_patterns(settings.rate, settings.steps, settings.metric)
-        self.longest_compile_s = _COMPILES_S
         self._attempts: dict[int, _Attempt] = {}
         self._from_nothing: set[int] = set()
         self._gpu_faults: Counter[int] = Counter()
@@ -135,10 +135,10 @@ class CommandKind:
         if settings.tag is not None:
             events = EventReader(run_dir, settings.tag, time.time(), running_s)
         progress = ProgressReader(output, self._own, running_s(), running_s, events)
-        reader = _Recorder(progress, run.metrics)
         # On CPU cores alone nothing is compiled that others could use.
-        program = job.program if place.devices else ""
-        return Start(process, program, (reader,))
+        mark = _mark_of(job, self._names[place.site]) if place.devices else None
+        reader = _Recorder(progress, run.metrics, mark)
+        return Start(process, (reader,), is_awaited=mark is not None and not mark.exists())
 
     def _variables(self, job: CommandJob, run_dir: Path, cores: int) -> dict[str, str]:
         values = job.values(run_dir)
@@ -251,25 +251,40 @@ class CommandKind:
 
 
 class _Recorder:
-    """Keeps the lines of metrics of a command in its folder, as a training run does."""
+    """Keeps the lines of metrics of a command in its folder, as a training run does.
 
-    def __init__(self, reader: ProgressReader, metrics: Path) -> None:
-        self._reader, self._metrics = reader, metrics
+    With the first one it makes the file `mark`, if any: what is compiled is in its caches then.
+    """
+
+    def __init__(self, reader: ProgressReader, metrics: Path, mark: Path | None) -> None:
+        self._reader, self._metrics, self._mark = reader, metrics, mark
         self._is_first = True
 
     def new(self) -> list[dict[str, Any]]:
-        """See `Reader`."""
         lines = self._reader.new()
         if not lines:
             return lines
+        is_first, self._is_first = self._is_first, False
         with suppress(OSError):  # A full disk must not end the pack.
-            if self._is_first and self._metrics.exists():
+            if is_first and self._metrics.exists():
                 # An attempt that goes on from a checkpoint repeats some steps, or counts anew.
                 copy_history(self._metrics, self._metrics, lines[0]["env_steps"] - 1)
-            self._is_first = False
             with self._metrics.open("a") as file:
                 file.writelines(json.dumps(line) + "\n" for line in lines)
+            if is_first and self._mark is not None:
+                self._mark.parent.mkdir(parents=True, exist_ok=True)
+                self._mark.touch()
         return lines
+
+
+def _mark_of(job: CommandJob, machine: str | None) -> Path:
+    """The file that is there once such a job has reported anything on a machine.
+
+    It goes when the compilation cache is emptied. One that is wrong costs time: jobs then compile
+    the same at the same time.
+    """
+    key = hashlib.sha256(f"{machine} {job.program}".encode()).hexdigest()
+    return program_cache() / f"gmijax-job-{key}"
 
 
 @dataclass

@@ -129,7 +129,8 @@ class PackWork(Work[CommandJob]):
             gpus = sites[place.site].plan.layout.num_gpus
             return most[place.site] // gpus if place.devices else most[place.site]
 
-        return CommandKind(self.ranking, cast("PackPaths", paths), cores, at_once)
+        names = [site.name for site in sites]
+        return CommandKind(self.ranking, cast("PackPaths", paths), cores, names, at_once)
 
     def limiter(
         self, places: Places, sites: Sequence[Site], hosts: Sequence[Host], console: Console

@@ -20,16 +20,24 @@ MAX_MEMORY_FRACTION = 0.9
 
 @dataclass(frozen=True)
 class Slice:
-    """The share of one GMI."""
+    """The share of one GMI.
 
-    gmi: int  # Its id.
-    gpu: int  # Position of its GPU in the job.
-    device: str  # What the GMI's process sees: the UUID of a GPU or of a MIG instance, or `cpu`.
-    sm_percent: float | None  # Cap on SMs in percent, None for no cap.
-    # Fraction of the device's memory, None where memory is not partitioned.
+    Attributes:
+      gmi: its id.
+      gpu: position of its GPU in the job.
+      device: what the GMI's process sees: the UUID of a GPU or of a MIG instance, or `cpu`.
+      sm_percent: cap on SMs in percent, None for no cap.
+      memory_fraction: fraction of the device's memory, None where memory is not partitioned.
+      cpus: CPU cores that the process is pinned to; empty for no pinning.
+      priority: of its kernels among those of the GPU's other GMIs (MPS), None where all are alike.
+    """
+
+    gmi: int
+    gpu: int
+    device: str
+    sm_percent: float | None
     memory_fraction: float | None
-    cpus: tuple[int, ...]  # CPU cores that the process is pinned to; empty for no pinning.
-    # Of its kernels among those of the GPU's other GMIs (MPS), None where all are alike.
+    cpus: tuple[int, ...]
     priority: Priority | None = None
 
 
@@ -37,27 +45,38 @@ class Slice:
 class Plan:
     """All that is needed to launch a job.
 
+    Attributes:
+      layout: GPU -> GMIs.
+      slices: one per GMI, in order of id.
+      backend: how shares are enforced.
+      template: how roles map to GMIs.
+      num_envs_per_gmi: N.
+      strategy: gradient reduction, `none` for one GMI.
+      intra: exchange inside one GPU.
+      roles: what every GMI does, in order of id (see `gmijax.partition.templates`); none where
+        that is classes of the user's own.
+      reasons: what was decided for an `auto`, and why, one sentence each.
+      self_check: every GMI compares matrix products with float64 when it starts.
+      may_share: where the daemons of `mps` cannot be started, the GMIs may take turns instead.
+      selection: with `reduce.selection=measured` what the paper says and what was measured.
+      nodes: addresses of the nodes of the layout, in order; none in a job on one machine.
+
     Raises:
       ConfigError: slices or roles that do not fit the layout, or memory fractions over the limit.
     """
 
-    layout: Layout  # GPU -> GMIs.
-    slices: tuple[Slice, ...]  # One per GMI, in order of id.
-    backend: BackendName  # How shares are enforced.
-    template: TemplateName  # How roles map to GMIs.
-    num_envs_per_gmi: int  # N.
-    strategy: str  # Gradient reduction, `none` for one GMI.
-    intra: str  # Exchange inside one GPU.
-    # What every GMI does, in order of id (see `gmijax.partition.templates`); none where that is
-    # classes of the user's own.
+    layout: Layout
+    slices: tuple[Slice, ...]
+    backend: BackendName
+    template: TemplateName
+    num_envs_per_gmi: int
+    strategy: str
+    intra: str
     roles: tuple[str, ...]
-    reasons: tuple[str, ...] = ()  # What was decided for an `auto`, and why, one sentence each.
-    self_check: bool = False  # Every GMI compares matrix products with float64 when it starts.
-    # Where the daemons of `mps` cannot be started, the GMIs may take turns instead.
+    reasons: tuple[str, ...] = ()
+    self_check: bool = False
     may_share: bool = False
-    # With `reduce.selection=measured` what the paper says and what was measured.
     selection: Mapping[str, Any] = field(default_factory=dict)
-    # Addresses of the nodes of the layout, in order; none in a job on one machine.
     nodes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import Collectives, Communicator, FloatBuffer
+from gmijax.compile_once import compile_once
 from gmijax.learning.algorithm import IterationMetrics
 from gmijax.learning.learner import (
     ActingWeights,
@@ -132,7 +133,7 @@ def serve_rollouts(
     state = init_learner(learner, env.spec.obs_size, jax.random.key(0))
     packed, unpack = ravel_pytree(acting_weights(learner, state))
     program: Any = jax.jit(partial(_rollout, env, learner, unpack), donate_argnums=(2,))
-    program = program.lower(env.model, np.asarray(packed), env_state).compile()
+    program = compile_once(program.lower(env.model, np.asarray(packed), env_state))
     on_state("ready", 0)
     number = 0
     while (weights := mail.recv(trainer)) is not None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import pickle
+import sys
 import warnings
 from collections.abc import Sequence
 from functools import partial
@@ -89,7 +91,7 @@ def launch(
         "start_timeout_s": start_timeout_s,
         "capacity_bytes": int(pipe_mib * 2**20),
         "device_messages": device_messages,
-        "script": shipping.own_script(),
+        "sys_path": [os.path.abspath(entry) for entry in sys.path],
     }
     run = _new_run(run_dir, plan, config, roles, args)
     timeouts = Timeouts(
@@ -104,7 +106,7 @@ def launch(
     except GmijaxError as error:
         _explain(error, run)
         raise
-    return [shipping.load(output) for output in outputs]
+    return [pickle.loads(output) for output in outputs]
 
 
 def _new_run(
@@ -142,7 +144,7 @@ def _job(
         plan=plan,
         machine=machine,
         run=run,
-        kind=JobKind("gmijax.roles.worker", compile_once=False, shared=shared),
+        kind=JobKind("gmijax.roles.worker", shared=shared),
         timeouts=timeouts,
         on_warning=lambda text: warnings.warn(text, RuntimeWarning, stacklevel=2),
     )
@@ -156,7 +158,6 @@ def _roles(role: Role | Sequence[Role], plan: Plan) -> list[Role]:
     for each in roles:
         if not isinstance(each, Role):
             raise ConfigError(f"role={each!r}: expected a gmijax.Role, got {type(each).__name__}")
-        shipping.require_findable(type(each))
     if len(roles) != num_gmis:
         raise ConfigError(f"role: {len(roles)} roles for the {num_gmis} GMIs of {plan.layout}")
     return roles

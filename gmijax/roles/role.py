@@ -69,8 +69,8 @@ class Role(ABC):
 
     As with `multiprocessing.Process`, the constructor runs where the job is started and `run` in
     the GMI: the object is pickled in between. So it may hold numbers, names and numpy arrays;
-    environments and other things of jax are made in `run`. The class must be at the top level of
-    a file or a module, where the GMI finds it by name.
+    environments and other things of jax are made in `run`. The class may be one of a module, a
+    script, a notebook or a function.
 
     Examples:
       >>> class Average(Role):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import sys
 from typing import TYPE_CHECKING, Any
 
@@ -32,8 +33,8 @@ def _run(link: ChildLink) -> dict[str, Any]:
     block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
     device = _device_buffers(plan, link.gmi) if config["device_messages"] else None
     messenger = Messenger(block, config["timeout_s"], device)
-    sys.path[:] = config["script"]["sys_path"]  # As where the job was started.
-    role, args = shipping.load(link.paths.role.read_bytes(), config["script"])
+    sys.path[:] = config["sys_path"]  # As where the job was started.
+    role, args = pickle.loads(link.paths.role.read_bytes())
 
     def build(num_floats: int) -> SharedMemoryGroup:
         timeout_s = config["timeout_s"]

@@ -1,10 +1,9 @@
 """The GMI's side of supervision; stdlib only, so that it runs before jax is imported.
 
-The controller holds the write end of a pipe per GMI, the *lifeline*. One byte lets a GMI compile
-that was to wait for another, one asks it to finish, one ends it at once; end of file means that
-the controller is gone, however it ended, and so must the GMI be. While the lifeline holds a GMI
-ignores the signals that ask for an end: a batch system sends them to every process of a job, and
-the controller decides what becomes of it.
+The controller holds the write end of a pipe per GMI, the *lifeline*. One byte asks a GMI to
+finish, one ends it at once; end of file means that the controller is gone, however it ended, and
+so must the GMI be. While the lifeline holds a GMI ignores the signals that ask for an end: a batch
+system sends them to every process of a job, and the controller decides what becomes of it.
 """
 
 from __future__ import annotations
@@ -18,12 +17,13 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
 from gmijax.errors import CollectiveTimeout, ConfigError, ReportedError
+from gmijax.runs.compile_lock import ON_WAIT
 from gmijax.runs.folder import GmiPaths, RunPaths, write_json
 from gmijax.supervise.heartbeat import GmiState, Heartbeat, HeartbeatBlock
 
@@ -33,11 +33,9 @@ ENV_RUN_DIR: Final = "GMIJAX_RUN_DIR"
 ENV_LIFELINE_FD: Final = "GMIJAX_LIFELINE_FD"
 ENV_EXCHANGE_FD: Final = "GMIJAX_EXCHANGE_FD"
 ENV_PIPES_FD: Final = "GMIJAX_PIPES_FD"
-ENV_WAITS: Final = "GMIJAX_WAITS"
 ENV_HEARTBEAT_FD: Final = "GMIJAX_HEARTBEAT_FD"
 
 STOP_BYTE: Final = b"s"
-GO_BYTE: Final = b"g"
 END_BYTE: Final = b"e"
 
 LEFT_TO_CONTROLLER: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
@@ -55,10 +53,10 @@ class ChildLink:
       run: files of the run.
       paths: files of this GMI.
       exchange_fd: inherited file of the gradient exchange, None where there is none.
-      start_s: seconds of the parts of the start that are over, by name; see `end_part`.
+      start_s: seconds of the parts of the start that are over, by name; see `end_part`. Those for
+        which other processes compiled are `waiting` alone.
 
     Args:
-      waits: whether another GMI compiles before this one may.
       heartbeat_fd: inherited memory for beats and errors, None where nobody reads them.
     """
 
@@ -69,7 +67,6 @@ class ChildLink:
         lifeline_fd: int | None,
         exchange_fd: int | None,
         *,
-        waits: bool = False,
         heartbeat_fd: int | None = None,
     ) -> None:
         self.gmi = gmi
@@ -77,12 +74,9 @@ class ChildLink:
         self.exchange_fd = exchange_fd
         self.paths: GmiPaths = run.gmi(gmi)
         self._stop = threading.Event()
-        self._turn = threading.Event()
-        if not waits:
-            self._turn.set()
         self._block = HeartbeatBlock(heartbeat_fd)
         self._keeps_garbage = False
-        self.start_s: dict[str, float] = {}
+        self.start_s: dict[str, float] = {"waiting": 0.0}
         self._part_began_s = time.monotonic()
         if lifeline_fd is not None:
             threading.Thread(
@@ -110,14 +104,15 @@ class ChildLink:
         lifeline_fd = inherited_fd(environment, ENV_LIFELINE_FD)
         if lifeline_fd is not None:
             _leave_signals_to_controller()
-        return cls(
+        link = cls(
             gmi,
             RunPaths(Path(run_dir)),
             lifeline_fd,
             inherited_fd(environment, ENV_EXCHANGE_FD),
-            waits=ENV_WAITS in environment and lifeline_fd is not None,
             heartbeat_fd=inherited_fd(environment, ENV_HEARTBEAT_FD),
         )
+        ON_WAIT[:] = [link.waiting]
+        return link
 
     @property
     def stop_requested(self) -> bool:
@@ -139,21 +134,28 @@ class ChildLink:
         self.start_s[name] = now_s - self._part_began_s
         self._part_began_s = now_s
 
-    def begin_compiling(self) -> float:
-        """Says that this GMI compiles from now on, once it may; returns how long it waited, s.
-
-        Where all GMIs run the same programs one compiles them while the others load what they
-        need and wait here; then they find the programs in the compilation cache.
-        """
+    def begin_compiling(self) -> None:
+        """Says that this GMI compiles from now on."""
         self.end_part("tracing")
-        self._turn.wait()
-        self.end_part("waiting")
         self.beat("compiling", 0)
-        return self.start_s["waiting"]
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """While another process compiles: a time limit of the controller does not run."""
+        before, began_s = self._block.read(), time.monotonic()
+        self.beat("waiting", 0 if before is None else before.iteration)
+        try:
+            yield
+        finally:
+            waited_s = time.monotonic() - began_s
+            self.start_s["waiting"] += waited_s
+            self._part_began_s += waited_s
+            if before is not None:
+                self.beat(before.state, before.iteration)
 
     def beat(self, state: GmiState, iteration: int) -> None:
         """Reports progress; costs microseconds."""
-        if self._keeps_garbage and state not in ("starting", "compiling"):
+        if self._keeps_garbage and state not in ("starting", "waiting", "compiling"):
             self._keeps_garbage = False
             gc.freeze()  # Never looked through again.
             gc.enable()
@@ -179,8 +181,6 @@ class ChildLink:
                 received = b""
             if not received or END_BYTE in received:
                 _end_now()
-            if GO_BYTE in received:
-                self._turn.set()
             if STOP_BYTE in received:
                 self._stop.set()
 
@@ -201,8 +201,8 @@ def run_gmi(routine: Callable[[ChildLink], Mapping[str, Any] | None]) -> int:
             write_json(link.paths.result, result)
     except BaseException as error:  # The controller must learn of every way to fail.
         link.report_error(error)
-        if isinstance(error, SystemExit) and isinstance(error.code, int):
-            exit_codes[:] = [error.code]
+        if isinstance(error, SystemExit) and isinstance(error.code, int | None):
+            exit_codes[:] = [error.code or 0]
         raise
     link.beat("done", 0)
     exit_codes[:] = [0]

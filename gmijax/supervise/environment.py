@@ -12,7 +12,7 @@ from typing import Final
 from gmijax.machine.jax_settings import without_breaking
 from gmijax.machine.xla_on_cpu import POOL, XLA_FLAGS, flags_on_cpu, pool_on_cpu
 from gmijax.partition.plan import Plan, Slice
-from gmijax.supervise.child import ENV_CPUS, ENV_GMI, ENV_WAITS
+from gmijax.supervise.child import ENV_CPUS, ENV_GMI
 
 # The old and the new name of one JAX setting; JAX refuses to start when both are set.
 _MEMORY_FRACTION, _OLD_MEMORY_FRACTION = (
@@ -47,7 +47,7 @@ def gmi_environment(
       backend_environment: what the backend adds.
     """
     share = plan.slices[gmi]
-    dropped = (_OLD_MEMORY_FRACTION, _MEMORY_FRACTION, _SM_PERCENT, ENV_WAITS)
+    dropped = (_OLD_MEMORY_FRACTION, _MEMORY_FRACTION, _SM_PERCENT)
     kept = {k: value for k, value in without_breaking(inherited).items() if k not in dropped}
     # One thread beside a GPU: there the host only moves small arrays, and the GMIs of all GPUs
     # share the cores.

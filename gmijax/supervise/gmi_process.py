@@ -16,8 +16,6 @@ from gmijax.supervise.child import (
     ENV_HEARTBEAT_FD,
     ENV_LIFELINE_FD,
     ENV_RUN_DIR,
-    ENV_WAITS,
-    GO_BYTE,
     LEFT_TO_CONTROLLER,
     STACKS_SIGNAL,
     STOP_BYTE,
@@ -32,8 +30,7 @@ _GROUP_ENDS_S = 2.0
 class GmiProcess(WatchedGmi):
     """A started GMI, the leader of its own session and process group.
 
-    It inherits its lifeline, its heartbeat and `inherited_fds`, nothing else. With `waits` it
-    compiles nothing before `let_go`.
+    It inherits its lifeline, its heartbeat and `inherited_fds`, nothing else.
 
     Raises:
       GmiFailed: the program cannot be started.
@@ -46,8 +43,6 @@ class GmiProcess(WatchedGmi):
         environment: Mapping[str, str],
         run: RunPaths,
         inherited_fds: Mapping[str, int],
-        *,
-        waits: bool = False,
     ) -> None:
         paths = run.gmi(gmi)
         paths.root.mkdir(parents=True, exist_ok=True)
@@ -57,8 +52,6 @@ class GmiProcess(WatchedGmi):
         own = {ENV_LIFELINE_FD: self._lifeline.read_end, ENV_HEARTBEAT_FD: heartbeat_fd}
         inherited = {**own, **inherited_fds}
         variables = {name: str(fd) for name, fd in inherited.items()}
-        if waits:
-            variables[ENV_WAITS] = "1"
         variables = {**environment, **variables, ENV_RUN_DIR: str(run.root)}
         try:
             self._block = HeartbeatBlock(heartbeat_fd)
@@ -72,7 +65,7 @@ class GmiProcess(WatchedGmi):
         finally:
             os.close(self._lifeline.read_end)
             os.close(heartbeat_fd)
-        super().__init__(gmi, paths, self._process.pid, waits=waits)
+        super().__init__(gmi, paths, self._process.pid)
 
     @property
     def error(self) -> ReportedError | None:
@@ -141,9 +134,6 @@ class GmiProcess(WatchedGmi):
 
     def _refresh(self) -> None:
         self._heard(self._block.beats, self._block.read())
-
-    def _tell_to_go(self) -> None:
-        self._lifeline.write(GO_BYTE)
 
 
 def _spawn(

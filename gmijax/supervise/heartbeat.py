@@ -14,10 +14,10 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 
 from gmijax.errors import ReportedError
 
-GmiState = Literal["starting", "compiling", "ready", "running", "done"]
+GmiState = Literal["starting", "waiting", "compiling", "ready", "running", "done"]
 
 STATES: tuple[str, ...] = get_args(GmiState)
-"""The states of a GMI in the order in which it reaches them."""
+"""The states of a GMI in the order in which it reaches them; `waiting` for another to compile."""
 
 _BEATS, _STATE, _ITERATION, _PID, _ERROR_BYTES = range(5)
 _HEADER_BYTES: Final = 64
@@ -27,11 +27,17 @@ _MAX_MESSAGE, _MAX_TRACEBACK, _MAX_MISSING = 2000, 8000, 200
 
 
 class Heartbeat(NamedTuple):
-    """Last report of a GMI."""
+    """Last report of a GMI.
 
-    state: GmiState  # How far it is.
-    iteration: int  # Training iterations done.
-    pid: int  # The process that uses the GPU; not the started one where that is a wrapper.
+    Attributes:
+      state: how far it is.
+      iteration: training iterations done.
+      pid: the process that uses the GPU; not the started one where that is a wrapper.
+    """
+
+    state: GmiState
+    iteration: int
+    pid: int
 
     @property
     def is_ready(self) -> bool:

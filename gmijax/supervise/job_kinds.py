@@ -43,14 +43,16 @@ SharedBlocks = Mapping[str, Callable[[], int]]
 
 @dataclass(frozen=True)
 class JobKind:
-    """Main of the GMIs of a job, and the memory that they share."""
+    """Main of the GMIs of a job, and the memory that they share.
 
-    module: str  # Main of every GMI, started by name.
-    # Whether all GMIs run the same programs, so that one compiles them for all.
-    compile_once: bool = True
-    # The memory that the GMIs of a plan share, beside that of the communicator.
+    Attributes:
+      module: main of every GMI, started by name.
+      shared: the memory that the GMIs of a plan share, beside that of the communicator.
+      calls: between GMIs of different nodes, which connect by TCP: who listens, and who calls.
+    """
+
+    module: str
     shared: Callable[[Plan], SharedBlocks] = lambda _: MappingProxyType({})
-    # Between GMIs of different nodes, which connect by TCP: who listens, and who calls.
     calls: Callable[[Plan], Sequence[tuple[int, int]]] = lambda _: ()
 
 
@@ -68,10 +70,10 @@ def training_kind(config: TrainConfig) -> JobKind:
     """The kind of a training job."""
     if config.is_decoupled:
         shared = partial(_registers_and_channels, config)
-        return JobKind(SYNCHRONOUS.module, compile_once=False, shared=shared, calls=calls_of)
+        return JobKind(SYNCHRONOUS.module, shared=shared, calls=calls_of)
     if config.plan.template == "tdg_ex":
         shared = partial(pipes, ROLLOUT_PIPE_BYTES)
-        return JobKind(SYNCHRONOUS.module, compile_once=False, shared=shared)
+        return JobKind(SYNCHRONOUS.module, shared=shared)
     return SYNCHRONOUS
 
 

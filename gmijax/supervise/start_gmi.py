@@ -22,22 +22,30 @@ from gmijax.supervise.watched_gmi import GmiStatus, WatchedGmi
 
 @dataclass(frozen=True, kw_only=True)
 class Launch:
-    """What to run in the GMIs of a plan."""
+    """What to run in the GMIs of a plan.
 
-    plan: Plan  # Where GMIs live and what they share.
-    machine: Machine  # Where this is; see `detect_machine`.
-    run: RunPaths  # The run folder; what the GMIs read from it is there already.
-    kind: JobKind  # What the GMIs run, and what they share beside the block that reducers use.
-    timeouts: Timeouts  # Time limits.
-    # The first signal of `STOP_SIGNALS` asks the GMIs to finish by themselves; otherwise signals
-    # do what Python does with them.
+    Attributes:
+      plan: where GMIs live and what they share.
+      machine: where this is; see `detect_machine`.
+      run: the run folder; what the GMIs read from it is there already.
+      kind: what the GMIs run, and what they share beside the block that reducers use.
+      timeouts: time limits.
+      stops_gracefully: the first signal of `STOP_SIGNALS` asks the GMIs to finish by themselves;
+        otherwise signals do what Python does with them.
+      variables: more environment variables of every GMI.
+      on_warning: called with a sentence when the job runs otherwise than planned.
+      is_enough: true once the job has what it needs: the GMIs then finish as after a first signal;
+        None: it ends by itself.
+    """
+
+    plan: Plan
+    machine: Machine
+    run: RunPaths
+    kind: JobKind
+    timeouts: Timeouts
     stops_gracefully: bool = True
-    # More environment variables of every GMI.
     variables: Mapping[str, str] = field(default_factory=dict)
-    # Called with a sentence when the job runs otherwise than planned.
     on_warning: Callable[[str], None] = lambda _: None
-    # True once the job has what it needs: the GMIs then finish as after a first signal; None: it
-    # ends by itself.
     is_enough: Callable[[tuple[GmiStatus, ...]], bool] | None = None
 
 
@@ -53,11 +61,11 @@ def environment_of(launch: Launch, gmi: int, added: Mapping[str, str]) -> dict[s
     return {**variables, **launch.variables}
 
 
-StartGmi = Callable[[int, bool], WatchedGmi]
+StartGmi = Callable[[int], WatchedGmi]
 
 
 def start_gmi(
-    launch: Launch, backend: Backend, inherited_fds: Mapping[str, int], gmi: int, waits: bool
+    launch: Launch, backend: Backend, inherited_fds: Mapping[str, int], gmi: int
 ) -> GmiProcess:
     """Starts a GMI on this machine; see `GmiProcess`."""
     return GmiProcess(
@@ -66,5 +74,4 @@ def start_gmi(
         environment_of(launch, gmi, backend.environment(gmi)),
         launch.run,
         inherited_fds,
-        waits=waits,
     )

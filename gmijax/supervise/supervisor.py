@@ -39,7 +39,7 @@ class Supervisor:
       backend: that of the plan, entered.
       inherited_fds: open files that every GMI inherits, by the environment variable that will
         hold the number of the descriptor.
-      start: starts a GMI, `(gmi, waits)`; None: on this machine.
+      start: starts a GMI; None: on this machine.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Supervisor:
 
     def _status_of(self, gmi: int) -> GmiStatus:
         if gmi not in self._started:
-            return GmiStatus(gmi, "waiting", 0, None, None)
+            return GmiStatus(gmi, "starting", 0, None, None)
         status = self._started[gmi].status()
         is_stopping = self._stop_deadline_s is not None and status.state == "running"
         return status._replace(state="stopping") if is_stopping else status
@@ -95,7 +95,6 @@ class Supervisor:
                 self._start(gmi)
             while self._alive():
                 self._raise_failure()
-                self._let_go()
                 self._handle_stop()
                 if self._all_ready_s is None and all(p.is_ready for p in self._started.values()):
                     # Once, when every GMI holds its share.
@@ -120,19 +119,9 @@ class Supervisor:
         return [process for process in self._started.values() if process.exit_code is None]
 
     def _start(self, gmi: int) -> None:
-        node_of = self._launch.plan.layout.node_of
-        # The first one of a node compiles for all there.
-        is_first = all(node_of(other) != node_of(gmi) for other in self._started)
-        process = self._start_gmi(gmi, self._launch.kind.compile_once and not is_first)
+        process = self._start_gmi(gmi)
         self._started[gmi] = process
         self._backend.started(process.pid)
-
-    def _let_go(self) -> None:
-        """Lets those compile that wait for the first one, once it has."""
-        waiting = [process for process in self._started.values() if process.waits]
-        if waiting and all(p.is_ready for p in self._started.values() if not p.waits):
-            for process in waiting:
-                process.let_go()
 
     def _raise_failure(self) -> None:
         """Reads heartbeats and exit codes; raises for the GMI that failed first."""
@@ -211,8 +200,8 @@ class Supervisor:
         now_s = running_s()
         for process in self._alive():
             state = process.beat.state
-            if process.waits:
-                continue  # The one that it waits for has a time limit.
+            if state == "waiting":
+                continue  # The process that compiles has a time limit.
             if state == "done" and now_s - process.progress_s > self._launch.timeouts.grace_s:
                 process.end_as_done()
                 continue

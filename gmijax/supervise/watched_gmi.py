@@ -12,15 +12,21 @@ from gmijax.supervise.heartbeat import Heartbeat
 
 
 class GmiStatus(NamedTuple):
-    """Where a GMI stands."""
+    """Where a GMI stands.
 
-    gmi: int  # Its id.
-    # `waiting` until it may compile, `stopping` once a running one was told to end, else what it
-    # says (see `heartbeat`).
+    Attributes:
+      gmi: its id.
+      state: `stopping` once a running one was told to end, else what it says (see `heartbeat`).
+      iteration: training iterations done.
+      pid: its process, None before the start.
+      exit_code: None while it runs; negative for the signal that ended it.
+    """
+
+    gmi: int
     state: str
-    iteration: int  # Training iterations done.
-    pid: int | None  # Its process, None before the start.
-    exit_code: int | None  # None while it runs; negative for the signal that ended it.
+    iteration: int
+    pid: int | None
+    exit_code: int | None
 
 
 class WatchedGmi(ABC):
@@ -29,22 +35,20 @@ class WatchedGmi(ABC):
     Attributes:
       gmi: its id.
       pid: the process that was started, leader of its group.
-      waits: whether it may not compile yet.
       exit_code: None while it runs; negative for the signal that ended it.
       beat: the newest heartbeat that `poll` saw.
       beats: how many of them there were.
       paths: files of this GMI.
-      progress_s: when it was started, let go, or its heartbeat last seen to be a new one;
+      progress_s: when it was started, or its heartbeat last seen to be a new one;
         by `running_s`.
       is_silent: whether its machine does not answer, so that nothing new is known of it.
     """
 
     is_silent = False
 
-    def __init__(self, gmi: int, paths: GmiPaths, pid: int, *, waits: bool) -> None:
+    def __init__(self, gmi: int, paths: GmiPaths, pid: int) -> None:
         self.gmi = gmi
         self.paths = paths
-        self.waits = waits
         self.exit_code: int | None = None
         self.beat = Heartbeat("starting", 0, pid)
         self.beats = 0
@@ -60,14 +64,7 @@ class WatchedGmi(ABC):
     def status(self) -> GmiStatus:
         """A snapshot for progress displays."""
         beat = self.beat
-        state = "waiting" if self.waits else beat.state
-        return GmiStatus(self.gmi, state, beat.iteration, beat.pid, self.exit_code)
-
-    def let_go(self) -> None:
-        """Lets a GMI compile that was started to wait."""
-        self.waits = False
-        self.progress_s = running_s()
-        self._tell_to_go()
+        return GmiStatus(self.gmi, beat.state, beat.iteration, beat.pid, self.exit_code)
 
     @property
     @abstractmethod
@@ -109,10 +106,6 @@ class WatchedGmi(ABC):
     @abstractmethod
     def close(self) -> None:
         """Drops the lifeline: a process that is still there ends itself."""
-
-    @abstractmethod
-    def _tell_to_go(self) -> None:
-        """Says that it may compile."""
 
     def _heard(self, beats: int, beat: Heartbeat | None) -> None:
         """Takes note of the newest heartbeat; one with equal content counts as progress too."""

@@ -19,30 +19,16 @@ from gmijax.runs.held import try_lock
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.backends.backend import Backend
 from gmijax.sweeps.children import Child, Process, Seen
-from gmijax.sweeps.compiled import CompiledPrograms
 from gmijax.sweeps.places import Place
 
 Order = Literal["ask_to_stop", "kill", "close"]
 
 
 class Start(NamedTuple):
-    """What is to be started where; see `Process` and `CompiledPrograms`."""
+    """What is to be started where; see `Process`."""
 
     place: Place
     process: Process
-    program: str
-
-
-class Started(NamedTuple):
-    """A job that was started.
-
-    Attributes:
-      child: its number on the machine, new for each start.
-      has_programs: whether the machine's cache holds its programs.
-    """
-
-    child: int
-    has_programs: bool
 
 
 class LocalHost:
@@ -61,7 +47,6 @@ class LocalHost:
         self.machine = machine
         self._leases, self._entered = ExitStack(), ExitStack()
         self._backend: Backend | None = None
-        self._compiled = CompiledPrograms()
         self._children: dict[int, Child] = {}
         self._clients: dict[int, int] = {}
         self._num_started = 0
@@ -86,8 +71,8 @@ class LocalHost:
         """
         self._backend = self._entered.enter_context(open_backend(plan, self.machine, run))
 
-    def start(self, start: Start) -> Started:
-        """Starts jobs.
+    def start(self, start: Start) -> int:
+        """Starts jobs; the number of their process on this machine, new for each start.
 
         Raises:
           GmijaxError: it cannot be started, or its daemon not be renewed.
@@ -104,8 +89,7 @@ class LocalHost:
         self._children[self._num_started] = child
         if start.process.is_client:
             self._clients[self._num_started] = start.place.slices[0].gmi
-        has_programs = not start.program or self._compiled.holds(start.program)
-        return Started(self._num_started, has_programs)
+        return self._num_started
 
     def look(self, child: int) -> Seen | None:
         """The newest that is known of a child, None before anything is."""
@@ -137,10 +121,6 @@ class LocalHost:
         return self._backend.why_no_client(
             self._clients[child], [one.pid for one in members_of(self._children[child].pid)]
         )
-
-    def add_program(self, program: str, is_lasting: bool) -> None:
-        """See `CompiledPrograms`."""
-        self._compiled.add(program, is_lasting=is_lasting)
 
     def load_of(self, device: str) -> GpuLoad | None:
         """What a GPU does at the moment."""

@@ -65,22 +65,18 @@ class Start(NamedTuple):
 
     Attributes:
       process: see there.
-      program: the same for those that compile the same programs.
       readers: of each of the jobs.
+      is_awaited: whether jobs with the same `program` wait for its first report, to find what it
+        has compiled.
     """
 
     process: Process
-    program: str
     readers: tuple[Reader, ...]
+    is_awaited: bool = False
 
 
 class Kind(Protocol[J]):
     """The kind of the jobs of a scheduler."""
-
-    @property
-    def longest_compile_s(self) -> float:
-        """Others that compile the same wait no longer for a first report."""
-        ...
 
     def together(self, job: J, queue: Sequence[J], alone: Collection[int]) -> tuple[J, ...]:
         """The job, and those in the queue that may run in one process with it."""

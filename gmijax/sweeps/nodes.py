@@ -18,7 +18,7 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
 from gmijax.sweeps.children import Seen
-from gmijax.sweeps.host import LocalHost, Order, Start, Started
+from gmijax.sweeps.host import LocalHost, Order, Start
 
 
 class SweepNode(Node):
@@ -76,7 +76,7 @@ class RemoteHost:
         self._run = run
         self._do("open", plan, run)
 
-    def start(self, start: Start) -> Started:
+    def start(self, start: Start) -> int:
         """See `LocalHost`."""
         return self._do("start", start)
 
@@ -87,10 +87,6 @@ class RemoteHost:
     def order(self, child: int, order: Order) -> None:
         """See `LocalHost`."""
         self._node.order(child, order)
-
-    def add_program(self, program: str, is_lasting: bool) -> None:
-        """See `LocalHost`."""
-        self._do("add_program", program, is_lasting)
 
     def why_no_client(self, child: int) -> str | None:
         """See `LocalHost`."""

@@ -128,11 +128,6 @@ def most_together(settings: SweepConfig, job: Job, jobs: Sequence[Job]) -> int:
     return sum(may_share(job, other) for other in jobs)
 
 
-def program_of(job: Job, count: int) -> str:
-    """The same for `count` such jobs that compile the same programs."""
-    return job.program if count == 1 else f"{count} x {job.program}"
-
-
 class OwnEnd(NamedTuple):
     """How a job has ended whatever became of others: complete, or failed by its `error`."""
 

@@ -48,7 +48,6 @@ class Running(Generic[J]):
       host: the machine.
       child: its number there.
       readers: of their metrics.
-      program: the same for those that compile the same.
       started_s: when, by the clock of this process.
       kill_at_s: when it is ended by force, by the clock of this process; None: it may go on.
       is_pruned: whether it was asked to end because others are better.
@@ -63,7 +62,6 @@ class Running(Generic[J]):
     host: Host
     child: int
     readers: tuple[Reader, ...]
-    program: str = ""
     started_s: float = field(default_factory=running_s)
     kill_at_s: float | None = None
     is_pruned: bool = False

@@ -27,6 +27,9 @@ _TICK_S = 0.1
 _KILLED_S = 15.0
 """For killed ones to be gone."""
 
+_FIRST_REPORT_S = 120.0
+"""Others that compile the same wait no longer for a first report."""
+
 
 class Scheduler(Generic[J]):
     """Starts jobs where there is room, reads how far they are, and ends them when told to.
@@ -68,7 +71,7 @@ class Scheduler(Generic[J]):
         self._alone: set[int] = set()
         self._faults: Counter[int] = Counter()
         self._running: dict[int, Running[J]] = {}
-        self._compiling: dict[tuple[int, str], int] = {}
+        self._awaited: dict[tuple[int, str], int | None] = {}
         self._unwritten: OSError | None = None
 
     def run(self, signals: StopSignals) -> None:
@@ -109,7 +112,7 @@ class Scheduler(Generic[J]):
                 continue
             if job.progress.state != "waiting" or self._start_if_it_fits(job):
                 continue
-            if not self._compiling_sites(job):
+            if not self._sites_to_avoid(job):
                 return  # In order, so that a large job is not passed by forever.
         while not self._queue and self._places.has_room() and (job := self._study.next()):
             self._jobs.append(job)
@@ -117,8 +120,7 @@ class Scheduler(Generic[J]):
                 self._queue.append(job)
 
     def _start_if_it_fits(self, job: J) -> bool:
-        avoid = self._compiling_sites(job)
-        # Others compile the same there; when they have, it is found in the cache.
+        avoid = self._sites_to_avoid(job)
         if not (num_gpus := self._places.num_gpus_with_room(avoid)):
             return False
         together = self._kind.together(job, self._queue, self._alone)
@@ -137,21 +139,23 @@ class Scheduler(Generic[J]):
             return False
         return True
 
-    def _compiling_sites(self, job: J) -> set[int]:
-        """Machines where another job compiles the same programs."""
-        return {site for site, program in self._compiling if program == job.program}
+    def _sites_to_avoid(self, job: J) -> set[int]:
+        """Machines where another job compiles the same, which is found in a cache later."""
+        return {
+            site
+            for (site, program), number in self._awaited.items()
+            if program == job.program and number is not None
+        }
 
     def _start(self, jobs: tuple[J, ...], place: Place) -> None:
         host, first = self._hosts[place.site], jobs[0]
         start = self._kind.start(jobs, place)
         for job in jobs:
             job.progress.read(self._paths.job(job.number), self._ranking)
-        started = host.start(Start(place, start.process, start.program))
-        if not started.has_programs:
-            self._compiling[place.site, first.program] = first.number
-        self._running[first.number] = Running(
-            jobs, place, host, started.child, start.readers, start.program
-        )
+        child = host.start(Start(place, start.process))
+        if start.is_awaited:
+            self._awaited.setdefault((place.site, first.program), first.number)
+        self._running[first.number] = Running(jobs, place, host, child, start.readers)
         for job in jobs:
             job.progress.begin(place.label, host.name)
         self._queue = [job for job in self._queue if job.progress.state == "waiting"]
@@ -162,9 +166,9 @@ class Scheduler(Generic[J]):
             for job, reader in zip(running.jobs, running.readers, strict=True):
                 for line in reader.new():
                     job.progress.report(line, self._ranking)
-                    self._nobody_waits_for(running, has_compiled=True)
-            if running_s() > running.started_s + self._kind.longest_compile_s:
-                self._nobody_waits_for(running, has_compiled=False)
+                    self._nobody_waits_for(running)
+            if running_s() > running.started_s + _FIRST_REPORT_S:
+                self._nobody_waits_for(running)
             if is_over:
                 self._finish(running)
             elif running.is_asked:
@@ -192,7 +196,7 @@ class Scheduler(Generic[J]):
         exit_code = (running.look() or Seen(None)).exit_code
         running.host.order(running.child, "close")
         self._places.give_back(running.place)
-        self._nobody_waits_for(running, has_compiled=False)
+        self._nobody_waits_for(running)
         again = [
             job
             for job, end in zip(running.jobs, ends, strict=True)
@@ -256,14 +260,12 @@ class Scheduler(Generic[J]):
                 return f"again, after {error}"
         return None
 
-    def _nobody_waits_for(self, running: Running[J], *, has_compiled: bool) -> None:
+    def _nobody_waits_for(self, running: Running[J]) -> None:
         """Its metrics are there, or it has ended, perhaps before it had compiled."""
         first = running.jobs[0]
         key = running.place.site, first.program
-        if self._compiling.get(key) == first.number:
-            del self._compiling[key]
-            with suppress(NodeLost):
-                running.host.add_program(running.program, has_compiled)
+        if self._awaited.get(key) == first.number:
+            self._awaited[key] = None
 
     def _drop_lost(self) -> None:
         for site in list(self._places.left):

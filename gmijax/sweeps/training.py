@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Sequence
 from typing import Final
 
@@ -17,7 +16,7 @@ from gmijax.sweeps.children import Process, Seen
 from gmijax.sweeps.hparams import write_hparams
 from gmijax.sweeps.jobs import Job, placed
 from gmijax.sweeps.kind import Start
-from gmijax.sweeps.packs import Packer, own_end, program_of
+from gmijax.sweeps.packs import Packer, own_end
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.places import Place
 from gmijax.sweeps.running import Outcome, Running
@@ -43,8 +42,6 @@ class TrainingKind:
         self._settings, self._paths = settings, paths
         self._packer = Packer(settings, paths)
 
-    longest_compile_s = math.inf
-
     def together(self, job: Job, queue: Sequence[Job], alone: Collection[int]) -> tuple[Job, ...]:
         """See `Kind`."""
         return self._packer.together(job, queue, alone)
@@ -68,7 +65,7 @@ class TrainingKind:
         readers = tuple(MetricsReader(run.metrics) for run in runs)
         for reader in readers:
             reader.new()  # Those are an earlier attempt's.
-        return Start(process, program_of(first, len(jobs)), readers)
+        return Start(process, readers)
 
     def why_hung(self, running: Running[Job]) -> str | None:
         """See `Kind`; a controller sees for itself whether its GMIs hang."""

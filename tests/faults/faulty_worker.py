@@ -152,11 +152,12 @@ def _before(owner: Any, name: str, act: Callable[..., object]) -> None:
 
 def _inject(faults: Faults) -> None:
     """Wraps what needs no jax; the rest when jax has been loaded."""
-    inner = ChildLink.beat
+    inner, injected = ChildLink.beat, []
 
     def beat(self: ChildLink, state: Any, iteration: int) -> None:
         inner(self, state, iteration)
-        if state == "compiling":
+        if state == "compiling" and not injected:  # It comes again after waiting.
+            injected.append(True)
             _inject_in_training(faults)
             faults.at("compiling")
         if state == "running":

@@ -265,7 +265,7 @@ def test_two_nodes_of_one_machine_use_the_daemon_of_the_first(
         assert len(mps.told("start")) == 1
         for gmi, node in enumerate(nodes):
             node.set_addresses(NodeAddresses(gmi, tuple(leaders), b"token"))
-            pid = node.start(gmi, False)
+            pid = node.start(gmi)
             assert isinstance(pid, int)
             deadline_s = time.monotonic() + 30
             while (without := node.verify({gmi: pid})) is not None:

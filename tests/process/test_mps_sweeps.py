@@ -38,11 +38,9 @@ def test_a_fatal_fault_ends_one_job_of_a_sweep_and_its_neighbours_go_on(
     mps: FakeMps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("gmijax.sweeps.training.MODULE", "fake_training_job")
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", f"{CHECKOUT}{os.pathsep}{TESTS}")
     here = machine(2, mps_control=mps.program)
-    # Of programs of their own, so that none waits for another one to compile.
-    jobs = list(jobs_of([compose(f"seed={n}", f"num_envs={n + 1}") for n in range(6)]))
+    jobs = list(jobs_of([compose(f"seed={n}") for n in range(6)]))
     settings, paths = SweepConfig(jobs_per_gpu=3, objective="return"), SweepPaths(tmp_path)
     plan = places_of(settings, here, {"auto"})
     with closing(LocalHost(here)) as host:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -141,20 +142,42 @@ def python(*words: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=150)
 
 
-def test_a_script_sends_and_returns_objects_of_its_own_classes(tmp_path: Path) -> None:
-    (tmp_path / "give.py").write_text(
-        SCRIPT + 'if __name__ == "__main__":\n'
-        '    found = gmijax.launch(gmijax.plan(gmis_per_gpu=2, backend="cpu"), Give())\n'
-        "    print(found == [Found(1), Found(0)])\n",
-    )
-    done = python("give.py")
+CALL = """
+found = gmijax.launch(gmijax.plan(gmis_per_gpu=2, backend="cpu"), Give())
+print(found == [Found(1), Found(0)])
+"""
+
+
+@pytest.mark.parametrize("is_file", [True, False], ids=["a script", "a notebook"])
+def test_objects_of_classes_without_a_module_are_sent_and_returned(
+    tmp_path: Path, is_file: bool
+) -> None:
+    (tmp_path / "give.py").write_text(SCRIPT + CALL)
+    done = python("give.py") if is_file else python("-c", SCRIPT + CALL)
     assert done.stdout == "True\n", done.stderr
 
 
-def test_a_script_that_starts_jobs_when_it_is_loaded_is_told_how_to_stop(tmp_path: Path) -> None:
+def test_a_role_of_a_function_with_what_it_uses() -> None:
+    @dataclass
+    class Found:
+        value: int
+
+    class Double(gmijax.Role):
+        def __init__(self) -> None:
+            self.double = lambda value: 2 * value
+
+        def run(self, value: int) -> Found:
+            others = [self.collective(Found(self.double(value))) for _ in range(2)]
+            assert all(isinstance(other, Found) for other in others)
+            return others[0]
+
+    assert launch(gmijax.plan(gmis_per_gpu=2, backend="cpu"), Double(), 3.0) == [Found(6.0)] * 2
+
+
+def test_a_module_that_starts_jobs_when_it_is_loaded_is_told_how_to_stop(tmp_path: Path) -> None:
     end = 'gmijax.launch(gmijax.plan(backend="cpu"), Give())\n'
     (tmp_path / "give.py").write_text(SCRIPT + end)
-    done = python("give.py")
+    done = python("-c", "import give")
     assert "ConfigError: gmijax.launch: called inside a GMI" in done.stderr
     assert 'if __name__ == "__main__":' in done.stderr
 

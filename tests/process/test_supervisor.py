@@ -70,25 +70,72 @@ def once_all_iterate(act: Callable[[Supervisor, Ticks], None]) -> Callable[..., 
     return at_tick
 
 
-def test_the_first_compiles_alone_and_all_have_their_cores_and_what_they_share(run: RunPaths):
+def test_one_compiles_alone_and_all_have_their_cores_and_what_they_share(run: RunPaths):
     exchange, hold = os.memfd_create(""), run.root / "hold"
-    hold.touch()  # Until the first tick.
+    hold.touch()
     try:
         ticks = run_job(
             cpu_supervisor(run, ["clean", "clean"], {ENV_EXCHANGE_FD: exchange}),
-            lambda _, __: hold.unlink(missing_ok=True),
+            once_in_states(["compiling", "waiting"], hold.unlink),
         )
         assert os.pread(exchange, 10, 0) == b"xx"
     finally:
         os.close(exchange)
-    assert [status.state for status in ticks[0]] == ["starting", "waiting"]
-    first_of_second = next(tick for tick in ticks if tick[1].state != "waiting")
-    assert first_of_second[0].state in ("ready", "running", "done")
     assert [status.exit_code for status in ticks[-1]] != [None, None]
+    assert (run.root / "compiled").read_text() == "1"  # The other one has loaded it.
     cores = split_cores(machine(0).cpu_cores, 2)
     assert [run.gmi(gmi).stdout.read_text().strip() for gmi in (0, 1)] == [
         str(list(own)) for own in cores
     ]
+
+
+def test_where_another_job_is_killed_as_it_compiles_the_next_one_goes_on(run: RunPaths):
+    with start_compiler(run) as compiler:
+        run_job(cpu_supervisor(run, ["clean"]), once_in_states(["waiting"], compiler.kill))
+    assert (run.root / "compiled").read_text() == "1"
+    assert read_json(run.gmi(0).root / "start_s.json")["waiting"] > 0.0
+
+
+def test_a_gmi_that_waits_for_another_job_ends_with_its_controller(run: RunPaths):
+    def fail(_: Supervisor, ticks: Ticks) -> None:
+        if ticks[-1][0].state == "waiting":
+            raise ZeroDivisionError
+
+    with start_compiler(run) as compiler:
+        with pytest.raises(ZeroDivisionError):
+            run_job(cpu_supervisor(run, ["clean"], grace=30.0), fail)
+        compiler.kill()
+
+
+def once_in_states(states: list[str], act: Callable[[], object]) -> Callable[..., None]:
+    """Acts at the first tick at which GMIs have these states, in any order."""
+    acted: list[bool] = []
+
+    def at_tick(_: Supervisor, ticks: Ticks) -> None:
+        if sorted(status.state for status in ticks[-1]) == sorted(states) and not acted:
+            acted.append(True)
+            act()
+
+    return at_tick
+
+
+def start_compiler(run: RunPaths) -> subprocess.Popen[str]:
+    """A process of another job that compiles the program of fake GMIs, and does not end."""
+    code = (
+        "import sys, time; from pathlib import Path\n"
+        "from gmijax.runs.compile_lock import compile_alone\n"
+        "def compile():\n    print('compiles', flush=True); time.sleep(600)\n"
+        "compile_alone(Path(sys.argv[1]), 'fake', '1', compile)"
+    )
+    compiler = subprocess.Popen(
+        [sys.executable, "-c", code, str(run.root / "cache")],
+        env={**os.environ, "PYTHONPATH": str(CHECKOUT)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert compiler.stdout is not None
+    assert compiler.stdout.readline() == "compiles\n"
+    return compiler
 
 
 @pytest.mark.parametrize(
@@ -103,12 +150,12 @@ def test_the_first_compiles_alone_and_all_have_their_cores_and_what_they_share(r
         # A GMI that lost its peer does not hide the peer.
         (
             ["lose_peer", "die_late"],
-            {"compile_once": False},
+            {},
             "GMI 1 failed: ended by SIGSEGV",
         ),
         (
             ["wait_in_vain", "stall"],
-            {"compile_once": False},
+            {},
             r"GMI 1 failed: made no progress after iteration 5; GMI 0 exit code 1: Collective",
         ),
         (

@@ -126,7 +126,7 @@ class ScriptedGmi(WatchedGmi):
     is_ended = False
 
     def __init__(self, gmi: int, run: RunPaths, state: Any) -> None:
-        super().__init__(gmi, run.gmi(gmi), os.getpid(), waits=False)
+        super().__init__(gmi, run.gmi(gmi), os.getpid())
         self._state, self._polls = state, 0
 
     def poll(self) -> int | None:
@@ -153,7 +153,6 @@ class ScriptedGmi(WatchedGmi):
     def ask_to_stop(self) -> None: ...
     def order_end(self) -> None: ...
     def close(self) -> None: ...
-    def _tell_to_go(self) -> None: ...
 
 
 def supervised(tmp_path: Path, state: Any) -> tuple[Supervisor, ScriptedGmi]:
@@ -162,7 +161,7 @@ def supervised(tmp_path: Path, state: Any) -> tuple[Supervisor, ScriptedGmi]:
     limits = dict.fromkeys(("start", "stall", "stop", "grace"), LIMIT_S)
     launch = make_launch(run, ["train"], plan, **limits)
     gmi = ScriptedGmi(0, run, state)
-    return Supervisor(launch, open_backend(plan, here, run), start=lambda _, __: gmi), gmi
+    return Supervisor(launch, open_backend(plan, here, run), start=lambda _: gmi), gmi
 
 
 @pytest.mark.parametrize("state", ["starting", "compiling", "running", "done"])
@@ -171,6 +170,13 @@ def test_a_gmi_has_not_stalled_meanwhile(tmp_path: Path, stop: Stop, state: Any)
     is_so = after_looks(stop)
     supervisor.run(lambda _: bool(is_so()))
     assert not gmi.is_ended
+
+
+def test_no_time_limit_runs_while_another_process_compiles(tmp_path: Path) -> None:
+    supervisor, gmi = supervised(tmp_path, "waiting")
+    gmi.progress_s -= 100 * LIMIT_S
+    supervisor.run()
+    assert gmi.exit_code == 0
 
 
 def test_a_gmi_that_is_to_stop_is_not_late(tmp_path: Path, stop: Stop) -> None:

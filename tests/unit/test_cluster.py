@@ -9,6 +9,7 @@ import signal
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from supervision import gpus_of_nodes, machine, make_launch, plan_on
@@ -37,6 +38,7 @@ from gmijax.errors import (
     ConfigError,
     GmiFailed,
     JobInterrupted,
+    NodeLost,
     ReportedError,
 )
 from gmijax.machine.snapshot import Machine
@@ -322,12 +324,12 @@ def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
     answers: dict[str, Any] = {"start": 99, "poll": seen}
     node = a_node()
     node._ask = lambda method, *_: FakeAnswer(answers[method])
-    gmi = node.start(2, False, GmiPaths(tmp_path))
+    gmi = node.start(2, GmiPaths(tmp_path))
     gmi.poll()  # Asks.
     assert gmi.poll() is None
     assert gmi.beat.iteration == 7
     assert gmi.is_ready
-    answers["poll"] = RuntimeError("The actor died.\nits node has died")
+    answers["poll"] = NodeLost("its node has died")
     while gmi.poll() is None:
         pass
     failure = describe_exit(2, gmi.exit_code or 0, gmi.error, gmi.paths.stderr)
@@ -335,6 +337,32 @@ def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
     assert not is_consequence(failure)
     assert gmi.request_stacks() is None
     gmi.kill()
+
+
+def test_an_error_of_a_node_is_no_lost_node(tmp_path: Path) -> None:
+    answers: dict[str, Any] = {"start": 99, "poll": ValueError("not a heartbeat")}
+    node = a_node()
+    node._ask = lambda method, *_: FakeAnswer(answers[method])
+    gmi = node.start(2, GmiPaths(tmp_path))
+    gmi.poll()  # Asks.
+    with pytest.raises(ValueError, match="not a heartbeat"):
+        gmi.poll()
+    assert gmi.poll() == -signal.SIGKILL  # The job can end: nothing is asked any more.
+
+
+def test_only_what_ray_says_itself_is_a_lost_node() -> None:
+    errors = pytest.importorskip("ray.exceptions")
+    bug = ValueError("a bug")
+    for raised, error, message in (
+        (errors.ActorDiedError(), NodeLost, "died"),
+        (errors.GetTimeoutError("it is late"), NodeLost, "^it is late$"),
+        (errors.RayTaskError("ask", "", bug).as_instanceof_cause(), ValueError, "^a bug$"),
+        (ZeroDivisionError("of this process"), ZeroDivisionError, "^of this process$"),
+    ):
+        get = Mock(side_effect=raised)
+        answer = ray_nodes._RayAnswer(SimpleNamespace(get=get, exceptions=errors), None)
+        with pytest.raises(error, match=message):
+            answer.get()
 
 
 def test_what_nodes_say_of_backends_is_heard_with_their_address(tmp_path: Path) -> None:
@@ -384,7 +412,7 @@ def test_a_node_starts_polls_and_ends_gmis(
     assert not isinstance(opened, BackendUnavailable)
     assert (opened.calls, opened.daemons) == ({}, {})
     node.set_addresses(NodeAddresses(0, (opened.leader,), b"token"))
-    pid = node.start(0, False)
+    pid = node.start(0)
     assert isinstance(pid, int)
     node.order(0, "kill")
     while (seen := node.poll()[0]).exit_code is None:

@@ -145,6 +145,32 @@ def test_limits_of_control_groups_of_version_2(tmp_path: Path):
     assert found.cpu_quota() is None
 
 
+def test_free_memory_in_a_step_of_slurm(tmp_path: Path):
+    # The process is below the group that has the limit.
+    step = "system.slice/slurmstepd.scope/job_7/step_0"
+    (tmp_path / "own").write_text(f"0::/{step}/user/task_0\n")
+    job, own = tmp_path / "root" / step, tmp_path / "root" / step / "user/task_0"
+    group(job.parent, memory__max=str(9 * 2**30), memory__current=str(2**30))
+    stat = f"anon 7\nactive_file {2**20}\ninactive_file {2**21}"
+    group(job, memory__max=str(4 * 2**30), memory__current=str(2**30), memory__stat=stat)
+    group(own, memory__max="max", memory__current=str(2**30))
+    found = CgroupLimits(tmp_path / "own", tmp_path / "root")
+    assert found.available_memory_mib() == 3072 + 3
+
+    (tmp_path / "own").write_text("4:memory:/slurm/uid_1000/job_7/step_0/task_0\n0::/\n")
+    step_1 = tmp_path / "root/memory/slurm/uid_1000/job_7/step_0"
+    stat = f"inactive_file 5\ntotal_active_file 0\ntotal_inactive_file {2**20}"
+    group(
+        step_1,
+        memory__limit_in_bytes=str(2**30),
+        memory__usage_in_bytes=str(2**29),
+        memory__stat=stat,
+    )
+    group(step_1 / "task_0", memory__limit_in_bytes=str(2**63 - 4096), memory__usage_in_bytes="1")
+    found = CgroupLimits(tmp_path / "own", tmp_path / "root")
+    assert found.available_memory_mib() == 512 + 1
+
+
 def test_limits_of_control_groups_of_version_1(tmp_path: Path):
     # In a container without a cgroup namespace the path is that of the host and not seen.
     (tmp_path / "own").write_text("4:memory:/a/b\n3:cpu,cpuacct:/a\n8:pids:/docker/1\n0::/x\n")

@@ -236,6 +236,7 @@ def test_broken_notes_of_compile_times_are_no_error(
 @pytest.mark.parametrize(
     ("states", "phase"),
     [
+        (("waiting", "waiting"), "waiting"),
         (("starting", "waiting"), "starting"),
         (("ready", "starting"), "compiling"),
         (("compiling", "waiting"), "compiling"),
@@ -244,7 +245,7 @@ def test_broken_notes_of_compile_times_are_no_error(
         ((), "running"),
     ],
 )
-def test_the_phase_of_several_gmis_never_goes_back(states: tuple[str, ...], phase: str):
+def test_the_phase_of_several_gmis_is_that_of_the_job(states: tuple[str, ...], phase: str):
     assert progress._phase_of(_status(*states)) == phase
 
 

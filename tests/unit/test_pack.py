@@ -186,7 +186,22 @@ def test_jobs_that_take_turns_get_the_index_of_their_gpu() -> None:
 def kind(tmp_path: Path) -> CommandKind:
     text = {"resume": "--resume {run_dir}/last", "cwd": "{run_dir}", "stop_signal": "INT"}
     settings = PackConfig(**text, env={"NAME": "pack{job}"})
-    return CommandKind(settings, PackPaths(tmp_path, "pack"), [8], lambda _: 2)
+    return CommandKind(settings, PackPaths(tmp_path, "pack"), [8], [None], lambda _: 2)
+
+
+def test_others_wait_for_the_first_job_of_a_program_until_one_has_reported(
+    kind: CommandKind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
+    _, place = place_of()
+    job, other = CommandJob(0, {}, ("true", "{job}")), CommandJob(1, {}, ("false",))
+    start = kind.start((job,), place)
+    assert start.is_awaited
+    with start.process.log.open("a") as log:
+        log.write("6400: reward=12.500\n7000: reward=13.000\n")
+    assert start.readers[0].new()
+    assert not kind.start((job,), place).is_awaited  # In later packs too.
+    assert kind.start((other,), place).is_awaited
 
 
 def test_a_job_that_is_started_again_gets_the_words_to_resume(

@@ -24,7 +24,6 @@ INHERITED = {
     # What defines a share, and is that of another job here.
     "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE": "10",
     "CUDA_VISIBLE_DEVICES": "0,1",
-    "GMIJAX_WAITS": "1",
     "XLA_CLIENT_MEM_FRACTION": "0.9",
     "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.5",
     # What other programs of the user compute with.

@@ -1,4 +1,4 @@
-"""A sweep over nodes without Ray: places, nodes that are lost, who compiles, what Ray is asked."""
+"""A sweep over nodes without Ray: places, nodes that are lost, who is first, what Ray is asked."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.held import OpenFolder
 from gmijax.supervise.run_gmis import StopSignals
-from gmijax.sweeps import jobs_per_gpu, scheduler
+from gmijax.sweeps import jobs_per_gpu, kind, scheduler
 from gmijax.sweeps.children import Seen
-from gmijax.sweeps.host import LocalHost, Order, Start, Started
+from gmijax.sweeps.host import LocalHost, Order, Start
 from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.nodes import RemoteHost, SweepNode, nodes_of, num_cpus_of
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Places, Site, places_of
+from gmijax.sweeps.places import Place, Places, Site, places_of
 from gmijax.sweeps.report import Report
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import Study
@@ -49,10 +49,9 @@ class FakeHost(LocalHost):
         self.seen: dict[int, Seen] = {}
         self.started: list[int] = []
         self.folders: list[list[Path]] = []  # Of the jobs of each start.
-        self.programs: set[str] = set()
         self._numbers = itertools.count()
 
-    def start(self, start: Start) -> Started:
+    def start(self, start: Start) -> int:
         if self.lost is not None:
             raise NodeLost(self.lost)
         assert start.process.order is not None
@@ -64,7 +63,7 @@ class FakeHost(LocalHost):
         self.running[child] = int(order.stem)
         self.started.append(self.running[child])
         self.folders.append(folders)
-        return Started(child, start.program in self.programs)
+        return child
 
     @property
     def together(self) -> list[list[str]]:
@@ -79,10 +78,6 @@ class FakeHost(LocalHost):
             self.seen[child] = Seen(130)
         if order == "close":
             del self.running[child]
-
-    def add_program(self, program: str, is_lasting: bool) -> None:
-        del is_lasting
-        self.programs.add(program)
 
     def end(self, exit_code: int = 0) -> None:
         """Ends all jobs that run there; they are complete if that is 0."""
@@ -102,15 +97,15 @@ class Sweep:
         plan = places_of(self.settings, machine(0), {"auto"})
         self.places = Places([Site(plan, node.machine, node.name) for node in self.nodes])
 
-    def run(self, *steps: Any) -> None:
+    def run(self, *steps: Any, kind: type[TrainingKind] = TrainingKind) -> None:
         """Runs it; the steps are called one after another, the last one in every tick."""
         left = list(steps)
 
         def tick() -> None:
             (left.pop(0) if len(left) > 1 else left[0])()
 
-        kind, ranking = TrainingKind(self.settings, self.paths), self.settings
-        args = kind, ranking, self.paths, self.places, self.nodes, tick
+        ranking = self.settings
+        args = kind(ranking, self.paths), ranking, self.paths, self.places, self.nodes, tick
         Scheduler(self.jobs, Study(), *args).run(StopSignals())
 
     def states(self) -> list[str]:
@@ -127,7 +122,7 @@ def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def jobs(count: int, *overrides: str) -> list[Job]:
-    """Jobs whose programs differ, so that none waits for another."""
+    """Jobs whose programs differ."""
     return list(jobs_of([compose(f"num_envs={16 * (n + 1)}", *overrides) for n in range(count)]))
 
 
@@ -252,7 +247,26 @@ def test_a_profile_of_a_job_with_two_gpus_has_both(
     assert host.started == [0, 0]
 
 
-def test_equal_programs_compile_once_on_each_node(tmp_path: Path) -> None:
+class AwaitedKind(TrainingKind):
+    """Jobs that compile what others of their program find in a cache."""
+
+    def start(self, jobs: tuple[Job, ...], place: Place) -> kind.Start:
+        return super().start(jobs, place)._replace(is_awaited=True)
+
+
+def test_jobs_that_wait_for_a_lock_by_themselves_start_at_once(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path, jobs_of([compose(f"seed={seed}") for seed in range(4)]))
+    starts: list[list[int]] = []
+
+    def look() -> None:
+        starts.append([len(node.started) for node in sweep.nodes])
+        sweep.end_all()
+
+    sweep.run(look)
+    assert starts[0] == [2, 2]
+
+
+def test_the_first_job_of_a_program_runs_alone_on_each_node(tmp_path: Path) -> None:
     alike = jobs_of([compose(f"seed={seed}") for seed in range(6)])
     sweep = Sweep(tmp_path, alike)
     starts: list[tuple[int, int]] = []
@@ -264,9 +278,9 @@ def test_equal_programs_compile_once_on_each_node(tmp_path: Path) -> None:
         if len(starts) > 6:
             sweep.end_all()
 
-    sweep.run(look)
+    sweep.run(look, kind=AwaitedKind)
     assert starts[:3] == [(1, 1)] * 3
-    assert starts[3] == (3, 1)  # The second node still compiles.
+    assert starts[3] == (3, 1)  # On the second node the first one still runs.
     assert sweep.states() == ["completed"] * 6
 
 

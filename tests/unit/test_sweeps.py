@@ -24,7 +24,6 @@ from gmijax.runs.held import OpenFolder, is_locked, locked
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps import jobs_per_gpu
-from gmijax.sweeps.compiled import CompiledPrograms
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import Job, jobs_of, placed, require_placeable, state_of
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
@@ -120,22 +119,6 @@ def test_configurations_differ_by_what_they_are_named() -> None:
     assert len({job.program for job in jobs}) == 2
     alike = [compose(f"seed={n}", f"algo.learning_rate={n + 1}e-4") for n in range(2)]
     assert len({job.program for job in jobs_of(alike)}) == 1
-
-
-def test_what_a_job_has_compiled_is_known_to_later_sweeps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
-    first, alike, other = jobs_of(
-        [compose("seed=0"), compose("seed=1", "algo.learning_rate=1e-4"), compose("num_envs=16")]
-    )
-    programs = CompiledPrograms()
-    programs.add(first.program, is_lasting=False)  # It has failed before.
-    assert programs.holds(alike.program)
-    assert not CompiledPrograms().holds(alike.program)
-    programs.add(first.program, is_lasting=True)
-    assert CompiledPrograms().holds(alike.program)
-    assert not CompiledPrograms().holds(other.program)
 
 
 @pytest.mark.parametrize(

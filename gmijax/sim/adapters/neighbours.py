@@ -40,7 +40,6 @@ class _Neighbours(importlib.abc.MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """See `importlib.abc.MetaPathFinder`."""
         if path is not None or fullname in sys.stdlib_module_names:
             return None  # What is inside of a package is asked of that package.
         found = PathFinder.find_spec(fullname, [self._folder], target)
