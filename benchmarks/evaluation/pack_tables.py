@@ -15,6 +15,7 @@ from benchmarks.evaluation.figures import (
     shown,
 )
 from benchmarks.records import RESULTS, Call, calls_by_date
+from benchmarks.steady import are_alike
 
 _HEAD = (
     "training | at once | steps/s while all report: | over one: | trainings per hour: | over one:"
@@ -32,6 +33,11 @@ class _Training(NamedTuple):
     call: Call
     file: str
     ways: Mapping[str, Sequence[Mapping[str, Any]]]
+
+    @property
+    def is_mix(self) -> bool:
+        """Whether its jobs are of several kinds, whose steps do not add up."""
+        return not all(are_alike(row["jobs"]) for rows in self.ways.values() for row in rows)
 
     def rate(self, way: str, key: str) -> Figure | None:
         """A rate over the repeats of a way."""
@@ -115,6 +121,7 @@ def _rows(name: str, training: _Training) -> list[list[str]]:
     for way in training.ways:
         cells = [name if not rows else "", way]
         for key, form in ((_STEPS, ",.0f"), (_FINISHED, ",.1f")):
-            cells += [shown(training.rate(way, key), form), shown(training.over_one(way, key))]
+            gained = shown(training.rate(way, key), form), shown(training.over_one(way, key))
+            cells += ("", "") if training.is_mix and key == _STEPS else gained
         rows.append(cells)
     return rows
