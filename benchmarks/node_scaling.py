@@ -15,7 +15,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
-from benchmarks.evaluation.figures import markdown, rate, results_of
+from benchmarks.evaluation.figures import rate, results_of
+from benchmarks.evaluation.writer import markdown
 from gmijax.collectives.strategies import predicted_s
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout

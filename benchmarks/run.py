@@ -196,7 +196,7 @@ def table(results: dict[str, Any]) -> str:
 
 def _of_all(summaries: Sequence[Mapping[str, Any]], key: str) -> float:
     """Median of a figure over runs, NaN where one has none."""
-    values = [summary.get(key) for summary in summaries]
+    values: list[Any] = [summary.get(key) for summary in summaries]
     return math.nan if None in values else statistics.median(values)
 
 

@@ -5,15 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from benchmarks.evaluation.figures import (
-    NOT_MEASURED,
-    Figure,
-    figure,
-    link,
-    markdown,
-    origin,
-    shown,
-)
+from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
+from benchmarks.evaluation.writer import lines, link, markdown, origin
 from benchmarks.records import RESULTS, Call, calls_by_date
 from benchmarks.steady import are_alike
 
@@ -46,10 +39,10 @@ class _Training(NamedTuple):
     def over_one(self, way: str, key: str) -> float | None:
         """A rate over that of one at a time."""
         alone = next((one for one in self.ways if one.startswith("1 ")), "")
-        rate, base = self.rate(way, key), self.rate(alone, key)
-        return rate.median / base.median if rate and base else None
+        return over(self.rate(way, key), self.rate(alone, key))
 
 
+@lines("packs")
 def packs() -> list[str]:
     """Steps per second and trainings per hour of every training, by number at once.
 
@@ -58,8 +51,8 @@ def packs() -> list[str]:
     found = _trainings()
     rows = [cells for name, training in found.items() for cells in _rows(name, training)]
     calls = {(one.file, one.call.date): one.call for one in found.values()}
-    lines = [f"- {link(file)}: {origin(call)}" for (file, _), call in calls.items()]
-    return [*markdown(_HEAD, rows), "", *(lines or [f"- `packs-*.json`: {NOT_MEASURED}"])]
+    files = [f"- {link(file)}: {origin(call)}" for (file, _), call in calls.items()]
+    return [*markdown(_HEAD, rows), "", *(files or [f"- `packs-*.json`: {NOT_MEASURED}"])]
 
 
 class Packed(NamedTuple):

@@ -21,7 +21,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from benchmarks.evaluation.figures import markdown
+from benchmarks.evaluation.writer import markdown
 from benchmarks.peers.comparisons import COMPARISONS, MJLAB, missing_package
 from benchmarks.peers.side import Side
 from benchmarks.peers.table import HEAD, OURS, row
