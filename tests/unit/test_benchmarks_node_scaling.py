@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from benchmarks import node_scaling as scaling
+from benchmarks import runner
 from benchmarks.runner import exit_code
 
 KNOWN = scaling.Measured({"ant": 0.07, "shadow_hand": 0.075}, 1.4e9, 34e9)
@@ -61,5 +62,6 @@ def test_iterations_are_as_the_tuned_settings_have_them():
 @pytest.mark.parametrize("bad", [["--gbit-per-s", "0"], ["--message-us", "-1"]])
 def test_bad_input_is_one_line(bad: list[str], monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["node_scaling", *bad])
+    monkeypatch.setattr(runner.signal, "signal", lambda *_: None)
     assert exit_code(scaling.main) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

@@ -19,6 +19,12 @@ from benchmarks.runner import FreeGpus, exit_code, failure_of, in_turn, start, w
 from gmijax.errors import ConfigError
 
 
+@pytest.fixture(autouse=True)
+def handlers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Signals stay those of the tests."""
+    monkeypatch.setattr(runner.signal, "signal", lambda *_: None)
+
+
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """What a benchmark takes for the time, in seconds."""
