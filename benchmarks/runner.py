@@ -22,6 +22,8 @@ from gmijax.errors import ConfigError
 STOP_S = 15.0
 """For a command that meets its deadline to save and end."""
 
+_ROOT = Path(__file__).resolve().parents[1]
+
 Case = TypeVar("Case", bound=Hashable)
 
 
@@ -128,10 +130,20 @@ def run_command(
     return wait_until(deadline_s, start(command, variables or {}))[0]
 
 
-def failure_of(command: Sequence[str]) -> str | None:
-    """Runs a command; the last line that it wrote to stderr if it failed, else None."""
+def failure_of(command: Sequence[str], folder: Path | None = None) -> str | None:
+    """Runs a command; the last line that it wrote to stderr if it failed, else None.
+
+    `folder` is what it works in, with the gmijax of this checkout; None: that of this process.
+    """
+    path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
     done = subprocess.run(
-        command, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        command,
+        cwd=folder,
+        env=None if folder is None else {**os.environ, "PYTHONPATH": path},
+        check=False,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
     return lines[-1] if done.returncode else None

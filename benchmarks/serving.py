@@ -44,8 +44,8 @@ class Setting(NamedTuple):
         """What tables call it."""
         return f"{self.task} {self.simulators} x {self.num_envs}, {self.backend}"
 
-    def command(self, given: argparse.Namespace, template: str, folder: Path) -> list[str]:
-        """One job."""
+    def command(self, given: argparse.Namespace, template: str, name: str) -> list[str]:
+        """One job, whose run has this name."""
         gmis = self.simulators + (template == "tdg")
         steps = self.simulators * self.num_envs * given.unroll_length * given.unrolls
         return [
@@ -53,7 +53,7 @@ class Setting(NamedTuple):
             *(f"num_envs={self.num_envs}", f"num_timesteps={steps}"),
             *(f"unroll_length={given.unroll_length}", f"plan.gmis_per_gpu={gmis}"),
             *(f"plan.template={template}", f"plan.backend={self.backend}"),
-            *(f"physics.impl={given.impl}", f"run.dir={folder}"),
+            *(f"physics.impl={given.impl}", f"run.name={name}"),
         ]
 
 
@@ -80,11 +80,11 @@ def measure(setting: Setting, given: argparse.Namespace) -> dict[str, Any]:
     runs: dict[str, list[Summary]] = {"tcg": [], "tdg": []}
     with tempfile.TemporaryDirectory() as scratch:
         for repeat, template in in_turn(given.templates, given.repeats):
-            folder = Path(scratch) / f"{as_word(setting.name)}-{template}-{repeat}"
-            if failure := failure_of(setting.command(given, template, folder)):
+            name = f"{as_word(setting.name)}-{template}-{repeat}"
+            if failure := failure_of(setting.command(given, template, name), Path(scratch)):
                 sys.stderr.write(f"{setting.name}, {template}: {failure}\n")
                 return {"name": setting.name, "failed": failure}
-            runs[template].append(read_json(RunPaths(folder).summary))
+            runs[template].append(read_json(RunPaths(Path(scratch) / "runs" / name).summary))
     first = next(found[0] for found in runs.values() if found)
     case: dict[str, Any] = {"name": setting.name, **setting._asdict(), "impl": first.get("impl")}
     case["runs"] = runs

@@ -70,6 +70,7 @@ def test_a_failure_is_the_last_line_of_stderr():
     assert failure_of(["true"]) is None
     assert failure_of(["false"]) == "exit code 1"
     assert failure_of(["sh", "-c", "echo one >&2; echo two >&2; exit 3"]) == "two"
+    assert failure_of(["sh", "-c", "test $PWD = / || exit 1"], Path("/")) is None
 
 
 def test_free_gpus_are_given_back():
@@ -118,9 +119,11 @@ class Commands:
         self.made: list[list[str]] = []
         self.failing = failing
 
-    def run(self, command: Sequence[str], *_: Any) -> int:
-        folder = Path(next(word for word in command if word.startswith("run.dir="))[8:])
-        self.made.append([str(word) for word in command if not word.startswith("run.dir=")][1:])
+    def run(self, command: Sequence[str], *given: Any) -> int:
+        (place,) = (word for word in command if word.startswith(("run.dir=", "run.name=")))
+        key, _, name = place.partition("=")
+        folder = Path(name) if key == "run.dir" else given[0] / "runs" / name
+        self.made.append([word for word in command if word != place][1:])
         if len(self.made) - 1 in self.failing:
             raise KeyboardInterrupt
         job = folder / "000"
@@ -138,8 +141,8 @@ class Commands:
             (folder / f"{name}.json").write_text(json.dumps(content))
         return 0
 
-    def failure_of(self, command: Sequence[str]) -> None:
-        self.run(command)
+    def failure_of(self, command: Sequence[str], folder: Path | None = None) -> None:
+        self.run(command, folder)
 
 
 SWEEP = ["-m", "gmijax.sweep", "run.measure_throughput=false"]
