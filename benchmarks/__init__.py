@@ -1,4 +1,5 @@
 """Benchmarks: cases as data (`cases`), a runner (`python -m benchmarks.run`), and their results.
 
-All benchmarks write by `records`; `python -m benchmarks` keeps the documents equal to the files.
+All benchmarks run their commands by `runner` and write by `records`; `python -m benchmarks` keeps
+the documents equal to the files.
 """

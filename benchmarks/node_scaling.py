@@ -15,7 +15,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
-from benchmarks.evaluation.figures import markdown, rate, results_of
+from benchmarks.evaluation.figures import rate, results_of
+from benchmarks.evaluation.writer import markdown
+from benchmarks.runner import exit_code
 from gmijax.collectives.strategies import predicted_s
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
@@ -64,13 +66,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.node_scaling", description=__doc__)
     parser.add_argument("--gbit-per-s", nargs="+", type=float, default=GBIT_PER_S, metavar="GBIT")
     parser.add_argument("--message-us", type=float, default=MESSAGE_US, help="time of a message")
-    arguments = parser.parse_args()
-    if arguments.message_us < 0:
-        parser.error(f"--message-us {arguments.message_us:g}: expected 0 or more")
-    try:
-        sys.stdout.write("\n".join(table(arguments.gbit_per_s, arguments.message_us)) + "\n")
-    except ConfigError as error:
-        parser.error(str(error))
+    given = parser.parse_args()
+    if given.message_us < 0:
+        raise ConfigError(f"--message-us {given.message_us:g}: expected 0 or more")
+    sys.stdout.write("\n".join(table(given.gbit_per_s, given.message_us)) + "\n")
     return 0
 
 
@@ -203,4 +202,4 @@ def model_fit(strategy: str) -> list[float]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -47,8 +46,7 @@ class Outcome(NamedTuple):
       wall_s: seconds from the start of its processes to their end.
       diverged_steps: in all.
       at_end: means over the last iterations of `HEALTH` and of the task's own metrics; of
-        evaluations, which act without noise, the last return and the highest; of checkpoints that
-        were played, the mean return and the share of whole episodes.
+        evaluations, which act without noise, the last return and the highest.
     """
 
     seed: str
@@ -92,12 +90,8 @@ def outcome_of(
     seed: str,
     completed: bool,
     wall_s: float,
-    played: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> Outcome:
-    """The outcome of a run; one that did not complete has not succeeded.
-
-    `played` are its checkpoints, as `benchmarks.played` writes them.
-    """
+    """The outcome of a run; one that did not complete has not succeeded."""
     curve = smoothed(found) if (found := rewards(lines)) else None
     names = [*HEALTH, *(name for name in (lines[-1] if lines else {}) if "metric/" in name)]
     evaluations = [line["eval/return"] for line in lines if line.get("eval/return") is not None]
@@ -110,12 +104,7 @@ def outcome_of(
         wall_s,
         sum(line.get("diverged_steps") or 0.0 for line in lines),
         {name: value for name in names if (value := _late_mean(lines, name)) is not None}
-        | ({"eval/last": evaluations[-1], "eval/peak": max(evaluations)} if evaluations else {})
-        | {
-            f"played/{which}/{name}": float(episodes[name])
-            for which, episodes in played.items()
-            for name in ("mean_return", "whole")
-        },
+        | ({"eval/last": evaluations[-1], "eval/peak": max(evaluations)} if evaluations else {}),
     )
 
 

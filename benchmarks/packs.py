@@ -2,7 +2,8 @@
 
 The same command as `gmijax pack` runs it: with one at a time, several under MPS, several by turns,
 and as many as `auto` takes. Beside the trainings per hour, start-up included, stand the steps per
-second while jobs report: the sum over jobs of the mean from their first report to their last.
+second while jobs report: the sum over jobs of the mean from their first report to their last, for
+jobs of one kind.
 Writes `benchmarks/results/packs-<device>.json` after every pack. With `--gpus` repeats run at the
 same time, each on a GPU of its own with its part of the cores.
 """
@@ -11,19 +12,18 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import tempfile
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
-from queue import Queue
 from typing import Any, NamedTuple
 
-from benchmarks.command import STOP_S, run_command
-from benchmarks.records import RESULTS, ResultsFile, file_name
-from gmijax.machine.snapshot import detect_machine
+from benchmarks.records import ResultsFile, file_name
+from benchmarks.runner import FreeGpus, deadline, exit_code, in_turn, options, run_command
+from benchmarks.steady import rate_of_jobs
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.runs.folder import read_json
 
 _OF_JOB = ("state", "env_steps", "env_steps_per_s", "start_s", "first_update_s", "wall_s")
@@ -41,107 +41,76 @@ class Way(NamedTuple):
         return f"{self.at_once}{of} at once, {self.backend}"
 
 
-class Site(NamedTuple):
-    """Where the packs of a repeat run."""
+class Benchmark:
+    """The packs of one call, in its file after each of them."""
 
-    prefix: tuple[str, ...]  # Words before the command, which keep it to some cores.
-    variables: Mapping[str, str]
+    def __init__(self, given: argparse.Namespace, machine: Machine) -> None:
+        self._given, self._machine = given, machine
+        device = machine.gpus[0].name if machine.gpus else "cpu"
+        settings = {**vars(given), "command": list(given.command)}
+        # Each row is of one GPU, however many work at the same time.
+        of_one = f"1 x {device}" if machine.gpus else None
+        path = given.out / file_name("packs", device)
+        self._file = ResultsFile(path, "packs", settings, device=of_one)
+        self._deadline_s = deadline(given.deadline_s)
+        count = min(given.gpus, len(machine.gpus))
+        self._free = FreeGpus(count) if count > 1 else None
 
+    def run(self, ways: Sequence[Way]) -> bool:
+        """Whether there was time for all."""
+        with ThreadPoolExecutor(self._free.count if self._free else 1) as pool:
+            return all([*pool.map(lambda n: self._repeat(n, ways), range(self._given.repeats))])
 
-def main() -> int:
-    """See the module."""
-    given = _options()
-    machine = detect_machine()
-    gpus = machine.gpus[: given.gpus]
-    device = machine.gpus[0].name if gpus else "cpu"
-    settings = {**vars(given), "command": list(given.command)}
-    # Each row is of one GPU, however many work at the same time.
-    path, of_one = given.out / file_name("packs", device), f"1 x {device}" if gpus else None
-    file = ResultsFile(path, "packs", settings, device=of_one)
-    ways = _ways(given, "mps" if gpus else "auto")
-    free: Queue[Site] = Queue()
-    for site in _sites(machine.cpu_cores, [gpu.index for gpu in gpus]):
-        free.put(site)
-    end_s = time.monotonic() + (given.deadline_s or math.inf)
+    def _repeat(self, number: int, ways: Sequence[Way]) -> bool:
+        num_rows = 0
+        with self._free.taken() if self._free else nullcontext(()) as gpus:
+            for _, way in in_turn(ways, 1, self._deadline_s):
+                row = {"name": self._given.name, "way": str(way), "repeat": number}
+                row |= self._pack(way, gpus)
+                with self._file.changing() as results:
+                    results["rows"] = [*results.get("rows", []), row]
+                sys.stdout.write(f"{json.dumps(row)}\n")
+                sys.stdout.flush()
+                num_rows += 1
+        return num_rows == len(ways)
 
-    def repeat(number: int) -> bool:
-        site = free.get()
-        try:
-            return all(_measure(given, way, number, site, file, end_s) for way in ways)
-        finally:
-            free.put(site)
+    def _pack(self, way: Way, gpus: Sequence[int]) -> dict[str, Any]:
+        given = self._given
+        with tempfile.TemporaryDirectory() as folder:
+            root = Path(folder) / "pack"
+            prefix, variables = self._kept_to(gpus[0]) if gpus else ((), {})
+            command = [
+                *(*prefix, sys.executable, "-m", "gmijax.pack", f"run.dir={root}"),
+                *(f"pack.copies={way.copies}", f"pack.jobs_per_gpu={way.at_once}"),
+                *(f"pack.backend={way.backend}", *given.keys, "--", *given.command),
+            ]
+            code = run_command(command, self._deadline_s, variables)
+            if not (root / "pack.json").exists():
+                return {"exit_code": code}
+            report = read_json(root / "pack.json")
+            jobs = [{key: job[key] for key in _OF_JOB} for job in report["jobs"]]
+            return {
+                "exit_code": code,
+                "copies": way.copies,
+                "steps_per_s": rate_of_jobs(jobs) if way.at_once == str(way.copies) else None,
+                "trainings_per_hour": report["trainings_per_hour"],
+                "wall_s": report["wall_s"],
+                "at_once": report["at_once"],
+                "jobs": jobs,
+                "curves": _curves(report["jobs"]) if given.curves else None,
+            }
 
-    with ThreadPoolExecutor(free.qsize()) as pool:
-        return 0 if all([*pool.map(repeat, range(given.repeats))]) else 1
-
-
-def _ways(given: argparse.Namespace, mps: str) -> list[Way]:
-    return [
-        *(Way(str(count), mps, count) for count in given.at_once),
-        *(Way(str(count), "share", count) for count in given.share),
-        *(Way("auto", "auto", count) for count in given.auto),
-        *(Way(str(count), mps, copies) for count, copies in given.many),
-    ]
-
-
-def _sites(cpus: Sequence[int], gpus: Sequence[int]) -> list[Site]:
-    """A GPU each with its part of the cores; all of the machine without several."""
-    if len(gpus) < 2:
-        return [Site((), {})]
-    each = len(cpus) // len(gpus)
-    return [
-        Site(
-            ("taskset", "--cpu-list", ",".join(map(str, cpus[at * each : (at + 1) * each]))),
-            {"CUDA_VISIBLE_DEVICES": str(gpu), "CUDA_DEVICE_ORDER": "PCI_BUS_ID"},
-        )
-        for at, gpu in enumerate(gpus)
-    ]
-
-
-def _measure(
-    given: argparse.Namespace, way: Way, repeat: int, site: Site, file: ResultsFile, end_s: float
-) -> bool:
-    """Adds a row to the file; False where no time was left for it."""
-    if time.monotonic() > end_s - STOP_S:
-        return False
-    found = _run(given, way, site, end_s)
-    row = {"name": given.name, "way": str(way), "repeat": repeat, **found}
-    with file.changing() as results:
-        results["rows"] = [*results.get("rows", []), row]
-    sys.stdout.write(f"{json.dumps(row)}\n")
-    sys.stdout.flush()
-    return True
+    def _kept_to(self, place: int) -> tuple[Sequence[str], dict[str, str]]:
+        """Words before a command, and its variables: one GPU with its part of the cores."""
+        cpus, gpus = self._machine.cpu_cores, self._machine.gpus
+        each = len(cpus) // min(self._given.gpus, len(gpus))
+        own = ",".join(map(str, cpus[place * each : (place + 1) * each]))
+        device = str(gpus[place].index)
+        variables = {"CUDA_VISIBLE_DEVICES": device, "CUDA_DEVICE_ORDER": "PCI_BUS_ID"}
+        return ("taskset", "--cpu-list", own), variables
 
 
-def _run(given: argparse.Namespace, way: Way, site: Site, end_s: float) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder) / "pack"
-        keys = (
-            f"run.dir={root}",
-            f"pack.copies={way.copies}",
-            f"pack.jobs_per_gpu={way.at_once}",
-            f"pack.backend={way.backend}",
-            *given.keys,
-        )
-        line = [*site.prefix, sys.executable, "-m", "gmijax.pack", *keys, "--", *given.command]
-        code = run_command(line, end_s, site.variables)
-        if not (root / "pack.json").exists():
-            return {"exit_code": code}
-        report = read_json(root / "pack.json")
-        rates = [job["env_steps_per_s"] or 0.0 for job in report["jobs"]]
-        return {
-            "exit_code": code,
-            "copies": way.copies,
-            "steps_per_s": sum(rates) if way.at_once == str(way.copies) else None,
-            "trainings_per_hour": report["trainings_per_hour"],
-            "wall_s": report["wall_s"],
-            "at_once": report["at_once"],
-            "jobs": [{key: job[key] for key in _OF_JOB} for job in report["jobs"]],
-            "curves": _curves(root, report["jobs"]) if given.curves else None,
-        }
-
-
-def _curves(root: Path, jobs: Sequence[dict[str, Any]]) -> list[list[list[float]]]:
+def _curves(jobs: Sequence[dict[str, Any]]) -> list[list[list[float]]]:
     """Steps and metric of the reports of each job."""
     curves = []
     for job in jobs:
@@ -151,8 +120,24 @@ def _curves(root: Path, jobs: Sequence[dict[str, Any]]) -> list[list[list[float]
     return curves
 
 
+def main() -> int:
+    """Measures what the command line asks for; returns 1 if its time was too short, else 0."""
+    given, machine = _options(), detect_machine()
+    return 0 if Benchmark(given, machine).run(_ways(given, has_gpu=bool(machine.gpus))) else 1
+
+
+def _ways(given: argparse.Namespace, *, has_gpu: bool) -> list[Way]:
+    mps = "mps" if has_gpu else "auto"
+    return [
+        *(Way(str(count), mps, count) for count in given.at_once),
+        *(Way(str(count), "share", count) for count in given.share),
+        *(Way("auto", "auto", count) for count in given.auto),
+        *(Way(str(count), mps, copies) for count, copies in given.many),
+    ]
+
+
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options("packs", __doc__)
     parser.add_argument("name", help="of the training, in the file")
     parser.add_argument("--at-once", type=int, nargs="*", default=[1, 2, 4, 8])
     parser.add_argument("--share", type=int, nargs="*", default=[4], help="without MPS")
@@ -165,7 +150,6 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--curves", action="store_true", help="keep the metric of every job")
     parser.add_argument("--deadline-s", type=float)
-    parser.add_argument("--out", type=Path, default=RESULTS)
     at = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
     given = parser.parse_args(sys.argv[1:at])
     given.command = sys.argv[at + 1 :]
@@ -180,4 +164,4 @@ def _pair(text: str) -> tuple[int, int]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -13,6 +13,7 @@ import shlex
 import subprocess
 import sys
 import threading
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
@@ -71,7 +72,18 @@ class ResultsFile:
 
     Attributes:
       path: the file; it has the call after the first change.
+      suite: what is measured.
       results: of this call.
+
+    Args:
+      path: the file.
+      suite: what is measured.
+      settings: all options of the command.
+      resume: go on with the last call of the file, and do not add one.
+      device: what is measured on, if not all GPUs of the machine.
+
+    Raises:
+      ConfigError: `resume`, and the last call was on other code or another machine.
     """
 
     def __init__(
@@ -83,20 +95,7 @@ class ResultsFile:
         resume: bool = False,
         device: str | None = None,
     ) -> None:
-        """Begins a call, or goes on with the file's last one.
-
-        Args:
-          path: the file.
-          suite: what was measured.
-          settings: all options of the command.
-          resume: go on with the last call.
-          device: what was measured on, if not all GPUs of the machine.
-
-        Raises:
-          ConfigError: `resume`, and the last call was on other code or another machine.
-        """
-        self.path = path
-        self._suite = suite
+        self.path, self.suite = path, suite
         self._lock = threading.Lock()
         self._call = _begin(settings, device)
         if resume and path.exists():
@@ -114,7 +113,7 @@ class ResultsFile:
             # Read again: another command may have added a call since.
             found = read_calls(self.path) if self.path.exists() else []
             calls = [call for call in found if call.date != self._call.date] + [self._call]
-            data = {"format": FORMAT, "suite": self._suite}
+            data = {"format": FORMAT, "suite": self.suite}
             write_json(self.path, {**data, "calls": [call._asdict() for call in calls]})
 
 
@@ -152,9 +151,7 @@ def device_name() -> str:
 def _begin(settings: Mapping[str, Any], device: str | None) -> Call:
     machine = detect_machine()
     commit, is_dirty = code_version()
-    counts = {gpu.name: 0 for gpu in machine.gpus}
-    for gpu in machine.gpus:
-        counts[gpu.name] += 1
+    counts = Counter(gpu.name for gpu in machine.gpus)
     return Call(
         commit=commit,
         is_dirty=is_dirty,
@@ -200,7 +197,7 @@ def _plain(value: Any) -> Any:
 def _of_old_file(found: Mapping[str, Any]) -> Call:
     """An old file says little of where it is from; summaries of runs in it name the device."""
     summaries = list(_summaries(found))
-    kinds = {summary["device"]["kind"]: 0 for summary in summaries if summary.get("device")}
+    kinds = dict.fromkeys(one["device"]["kind"] for one in summaries if one.get("device"))
     versions = next((s["versions"] for s in summaries if s.get("versions")), None)
     device = found.get("device") or ", ".join(kinds) or found.get("machine")
     known = {key: found.get(key) for key in ("commit", "date", "host", "driver", "command")}
@@ -212,12 +209,8 @@ def _of_old_file(found: Mapping[str, Any]) -> Call:
 
 
 def _summaries(found: Any) -> Iterator[Mapping[str, Any]]:
-    if isinstance(found, Mapping):
-        if "summary" in found:
-            yield found["summary"]
-        else:
-            for part in found.values():
-                yield from _summaries(part)
-    elif isinstance(found, list):
-        for part in found:
+    if isinstance(found, Mapping) and "summary" in found:
+        yield found["summary"]
+    elif isinstance(found, Mapping | list):
+        for part in found.values() if isinstance(found, Mapping) else found:
             yield from _summaries(part)

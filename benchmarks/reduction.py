@@ -12,10 +12,10 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
-from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
+from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.runner import exit_code, options
 from gmijax.collectives.strategies import BYTES_PER_FLOAT, predicted_s
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.control.strategy_selection import Probe, candidates, measure
@@ -41,28 +41,22 @@ LAYOUTS = (*SMALL, "2G3T", "4G1T", "4G4T")
 
 def main() -> int:
     """Measures what the command line asks for; returns the exit code."""
-    machine = detect_machine()
-    arguments = _arguments()
-    backend = arguments.backend or ("mps" if machine.gpus else "cpu")
-    try:
-        layouts = [layout_of(text) for text in arguments.layouts or _defaults(machine)]
-        if min(*arguments.sizes, arguments.calls) < 1:
-            raise ConfigError("--sizes, --calls: must be at least 1")
-        plans = {layout: plan_of(layout, backend, machine) for layout in layouts}
-        for layout, _ in PROBES.values():
-            if layout.num_gpus <= (len(machine.gpus) or layout.num_gpus):
-                plans.setdefault(layout, plan_of(layout, backend, machine))
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
-    path = arguments.out / file_name("reduction", "cpu" if backend == "cpu" else device_name())
-    book = ResultsFile(path, "reduction", {**vars(arguments), "backend": backend})
-    with book.changing() as results:
-        results.update(measure_all(plans, set(layouts), machine, arguments))
+    machine, given = detect_machine(), _options()
+    backend = given.backend or ("mps" if machine.gpus else "cpu")
+    layouts = [layout_of(text) for text in given.layouts or _defaults(machine)]
+    if min(*given.sizes, given.calls) < 1:
+        raise ConfigError("--sizes, --calls: must be at least 1")
+    probed = [layout for layout, _ in PROBES.values()]
+    probed = [one for one in probed if one.num_gpus <= (len(machine.gpus) or one.num_gpus)]
+    plans = {layout: plan_of(layout, backend, machine) for layout in (*layouts, *probed)}
+    path = given.out / file_name("reduction", "cpu" if backend == "cpu" else device_name())
+    file = ResultsFile(path, "reduction", {**vars(given), "backend": backend})
+    with file.changing() as results:
+        results.update(measure_all(plans, set(layouts), machine, given))
     for row in results["rows"]:
-        sys.stdout.write(line(row) + "\n")
+        sys.stdout.write(f"{line(row)}\n")
     for text in gains(results["rows"]):
-        sys.stdout.write(text + "\n")
+        sys.stdout.write(f"{text}\n")
     sys.stdout.write(f"written: {path}\n")
     return 0
 
@@ -71,16 +65,16 @@ def measure_all(
     plans: Mapping[Layout, Plan],
     wanted: set[Layout],
     machine: Machine,
-    arguments: argparse.Namespace,
+    given: argparse.Namespace,
 ) -> dict[str, Any]:
     """All rows; one job for each layout, and the bandwidths by two of them."""
     found: list[tuple[Layout, Probe, dict[str, Any]]] = []
     bandwidths: dict[str, float | None] = dict.fromkeys(PROBES)
     for layout, plan in plans.items():
-        probes = [p for size in arguments.sizes for p in candidates(plan, size)]
+        probes = [p for size in given.sizes for p in candidates(plan, size)]
         probes = probes if layout in wanted else []
         large = {probe: name for name, (at, probe) in PROBES.items() if at == layout}
-        rows = measure(plan, machine, [*probes, *large], arguments.calls)
+        rows = measure(plan, machine, [*probes, *large], given.calls)
         for probe, row in zip([*probes, *large], rows, strict=True):
             if "why_not" in row:
                 sys.stderr.write(f"{layout} {probe.name}: {row['why_not']}\n")
@@ -171,15 +165,14 @@ def _defaults(machine: Machine) -> tuple[str, ...]:
     return tuple(t for t in LAYOUTS if layout_of(t).num_gpus <= len(machine.gpus))
 
 
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
+def _options() -> argparse.Namespace:
+    parser = options("reduction", __doc__)
     parser.add_argument("--layouts", nargs="+", metavar="LAYOUT", help="2G3T or [[0,1],[2]]")
     parser.add_argument("--sizes", nargs="+", type=int, default=SIZES, metavar="FLOATS")
     parser.add_argument("--calls", type=int, default=100, help="calls to take the median of")
     parser.add_argument("--backend", choices=BACKENDS, help="of all rows; mps if there are GPUs")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
     return parser.parse_args()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -11,20 +11,18 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
-import re
 import statistics
-import subprocess
 import sys
 import tempfile
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from benchmarks.cases import SUITES, Case
-from benchmarks.free_gpus import FreeGpus
-from benchmarks.records import RESULTS, ResultsFile
+from benchmarks.records import ResultsFile
+from benchmarks.runner import FreeGpus, as_word, exit_code, failure_of, in_turn, options
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
@@ -35,119 +33,78 @@ CURVE_POINTS = 60
 
 def main() -> int:
     """Runs what the command line asks for; returns 1 if a run failed, else 0."""
-    suites = f"suites: {', '.join(sorted(SUITES))}"
-    parser = argparse.ArgumentParser(description=__doc__, epilog=suites)
-    parser.add_argument("suites", nargs="+", choices=sorted(SUITES), metavar="SUITE")
-    parser.add_argument(
-        "--only", default="", metavar="TEXT", help="cases with TEXT in their names"
-    )
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--gpus", type=int, help="run cases at the same time on so many GPUs")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON files")
-    parser.add_argument("--runs", type=Path, help="keep the run folders here")
-    parser.add_argument("--resume", action="store_true", help="add to the runs in the JSON file")
-    arguments = parser.parse_args()
-    cases = [c for suite in arguments.suites for c in SUITES[suite] if arguments.only in c.name]
-    if not cases:
-        parser.error(f"--only {arguments.only!r}: no case of these suites has that in its name")
-    if arguments.gpus is not None:
-        large = [case for case in cases if case.gpus > arguments.gpus]
-        if len(large) == len(cases):
-            parser.error(f"--gpus {arguments.gpus}: every case of these suites needs more")
-        for case in large:
-            sys.stderr.write(f"{case.name}: left out, it needs {case.gpus} GPUs\n")
-    wanted = {case.name for case in cases}
-    suites = [s for s in arguments.suites if any(case.name in wanted for case in SUITES[s])]
-    try:
-        books = {suite: _book(suite, wanted, arguments) for suite in suites}
-    except ConfigError as error:
-        parser.error(str(error))
+    given = _options()
+    files = [
+        (cases, _file(suite, cases, given))
+        for suite in given.suites
+        if (cases := [case for case in SUITES[suite] if given.only in case.name])
+    ]
+    if not files:
+        raise ConfigError(f"--only {given.only!r}: no case of these suites has that in its name")
+    large = [one for cases, _ in files for one in cases if one.gpus > (given.gpus or one.gpus)]
+    if len(large) == sum(len(cases) for cases, _ in files):
+        raise ConfigError(f"--gpus {given.gpus}: every case of these suites needs more")
+    for case in large:
+        sys.stderr.write(f"{case.name}: left out, it needs {case.gpus} GPUs\n")
     with tempfile.TemporaryDirectory() as scratch:
-        free = FreeGpus(arguments.gpus) if arguments.gpus else None
-        run_all(books, wanted, arguments.repeats, arguments.runs or Path(scratch), free)
-    for book in books.values():
-        sys.stdout.write(f"{table(book.results)}\nwritten: {book.path}\n")
-    return int(any(failures(book.results) for book in books.values()))
+        turns = [
+            _Turn(file, case, repeat, given.runs or Path(scratch))
+            for cases, file in files
+            for repeat, case in in_turn(cases, given.repeats)
+            if case not in large and not is_done(file.results, case, repeat)
+        ]
+        run_all(turns, FreeGpus(given.gpus) if given.gpus else None)
+    for _, file in files:
+        sys.stdout.write(f"{table(file.results)}\nwritten: {file.path}\n")
+    return int(any(failures(file.results) for _, file in files))
 
 
-def _book(suite: str, wanted: Collection[str], arguments: argparse.Namespace) -> ResultsFile:
-    """The file of a suite, with a call that has the suite's wanted cases."""
-    path = arguments.out / f"{suite}.json"
-    book = ResultsFile(path, suite, vars(arguments), resume=arguments.resume)
-    known = book.results.setdefault("cases", {})
-    for case in SUITES[suite]:
-        if case.name in wanted:
-            known.setdefault(case.name, {"command": command(case), "runs": []})
-    return book
+def _file(suite: str, cases: Sequence[Case], given: argparse.Namespace) -> ResultsFile:
+    """The file of a suite, with a call that has these cases."""
+    path = given.out / f"{suite}.json"
+    file = ResultsFile(path, suite, vars(given), resume=given.resume)
+    known = file.results.setdefault("cases", {})
+    for case in cases:
+        command = " ".join(("python -m gmijax.train", *case.overrides))
+        known.setdefault(case.name, {"command": command, "runs": []})
+    return file
 
 
-def missing(
-    results: Mapping[str, Any], cases: Collection[Case], repeats: int, gpus: int | None
-) -> list[tuple[int, Case]]:
-    """Runs to be made of `cases`: those that have not succeeded, none that needs more GPUs.
-
-    Every case once before any case again.
-    """
-    done = {
-        (run["repeat"], name)
-        for name, case in results["cases"].items()
-        for run in case["runs"]
-        if "summary" in run
-    }
-    return [
-        (repeat, case)
-        for repeat in range(repeats)
-        for case in cases
-        if (repeat, case.name) not in done and case.gpus <= (gpus or case.gpus)
-    ]
+def is_done(results: Mapping[str, Any], case: Case, repeat: int) -> bool:
+    """Whether a run has succeeded."""
+    runs = results["cases"][case.name]["runs"]
+    return any(run["repeat"] == repeat and "summary" in run for run in runs)
 
 
-def failures(results: Mapping[str, Any]) -> list[str]:
-    """Names of the cases of which a repeat failed, and did not succeed later."""
-    return [
-        name
-        for name, case in results["cases"].items()
-        if {run["repeat"] for run in case["runs"]}
-        - {run["repeat"] for run in case["runs"] if "summary" in run}
-    ]
+class _Turn(NamedTuple):
+    """One run that is to be made, in a new folder below `runs`."""
+
+    file: ResultsFile
+    case: Case
+    repeat: int
+    runs: Path
+
+    def run(self, overrides: Sequence[str]) -> None:
+        """Runs it, and writes: an interruption loses the running ones only."""
+        name = f"{self.file.suite}-{as_word(self.case.name)}-{self.repeat}"
+        folder = unused(self.runs / name)
+        done = run_case(self.case, self.repeat, (*overrides, f"run.dir={folder}"), folder)
+        with self.file.changing() as results:
+            kept = results["cases"][self.case.name]
+            kept["config"] = done.pop("config", kept.get("config"))
+            # Runs that go on at the same time are noted as they end: each has its number.
+            kept["runs"].append({**done, "repeat": self.repeat})
 
 
-def run_all(
-    books: Mapping[str, ResultsFile],
-    wanted: Collection[str],
-    repeats: int,
-    runs: Path,
-    free: FreeGpus | None,
-) -> None:
-    """Runs the cases `wanted` until each has `repeats` runs; in turn without `free`."""
+def run_all(turns: Sequence[_Turn], free: FreeGpus | None) -> None:
+    """One after the other, or as soon as GPUs are free for them."""
 
-    def run(suite: str, repeat: int, case: Case) -> None:
-        # Letters and digits only: the folder is a value on a command line.
-        name = re.sub(r"[^a-zA-Z0-9]+", "-", case.name)
-        folder = unused(runs / f"{suite}-{name}-{repeat}")
-        with free.taken(case.gpus) if free else nullcontext(()) as overrides:
-            done = run_case(case, repeat, (*overrides, f"run.dir={folder}"), folder)
-        # Runs that go on at the same time are noted as they end: who is which must be told.
-        add(suite, case, {**done, "repeat": repeat})
-
-    def add(suite: str, case: Case, run: dict[str, Any]) -> None:
-        """Takes in one run, and writes: an interruption loses the running ones only."""
-        with books[suite].changing() as results:
-            kept = results["cases"][case.name]
-            kept["config"] = run.pop("config", kept.get("config"))
-            kept["runs"].append(run)
+    def run(turn: _Turn) -> None:
+        with free.taken(turn.case.gpus) if free else nullcontext(()) as gpus:
+            turn.run((f"plan.gpus=[{','.join(map(str, gpus))}]",) if free else ())
 
     with ThreadPoolExecutor(free.count if free else 1) as pool:
-        started = [
-            pool.submit(run, suite, repeat, case)
-            for suite, book in books.items()
-            for repeat, case in missing(
-                book.results,
-                [case for case in SUITES[suite] if case.name in wanted],
-                repeats,
-                free and free.count,
-            )
-        ]
+        started = [pool.submit(run, turn) for turn in turns]
         try:
             for one in started:
                 one.result()
@@ -162,29 +119,14 @@ def unused(folder: Path) -> Path:
     return next(path for path in itertools.chain((folder,), more) if not path.exists())
 
 
-def run_case(case: Case, repeat: int, overrides: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    """One run: its `outcome`, or what its command said when it failed."""
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "gmijax.train"),
-            *(text.format(run=repeat) for text in case.overrides),
-            *overrides,
-        ],
-        check=False,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    if done.returncode == 0:
+def run_case(case: Case, repeat: int, overrides: Sequence[str], folder: Path) -> dict[str, Any]:
+    """One run: its `outcome`, or what its command wrote when it failed."""
+    own = (text.format(run=repeat) for text in case.overrides)
+    failure = failure_of([sys.executable, "-m", "gmijax.train", *own, *overrides])
+    if failure is None:
         return outcome(folder)
-    said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-    sys.stderr.write(f"{case.name}: {said[-1]}\n")
-    return {"failed": said[-1]}
-
-
-def command(case: Case) -> str:
-    """The command line of a case."""
-    return " ".join(("python -m gmijax.train", *case.overrides))
+    sys.stderr.write(f"{case.name}: {failure}\n")
+    return {"failed": failure}
 
 
 def outcome(folder: Path) -> dict[str, Any]:
@@ -204,14 +146,24 @@ def outcome(folder: Path) -> dict[str, Any]:
         ],
         "metrics": {k: v for k, v in lines[-1].items() if k.startswith("metric/")},
         "diverged_steps": sum(line["diverged_steps"] for line in lines),
-        "medians": {name: _median_of(lines, name) for name in names},
+        "medians": {name: median(lines, name) for name in names},
     }
 
 
-def _median_of(lines: list[dict[str, Any]], name: str) -> float | None:
-    """Over the lines that have a value."""
-    found = [line[name] for line in lines if line.get(name) is not None]
+def median(lines: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    """Over the lines that have a value; None of nothing."""
+    found = [line[key] for line in lines if line.get(key) is not None]
     return statistics.median(found) if found else None
+
+
+def failures(results: Mapping[str, Any]) -> list[str]:
+    """Names of the cases of which a repeat failed, and did not succeed later."""
+    return [
+        name
+        for name, case in results["cases"].items()
+        if {run["repeat"] for run in case["runs"]}
+        - {run["repeat"] for run in case["runs"] if "summary" in run}
+    ]
 
 
 def table(results: dict[str, Any]) -> str:
@@ -229,25 +181,36 @@ def table(results: dict[str, Any]) -> str:
         if not summaries:
             rows.append(f"{name:32} {case['runs'][-1]['failed'] if case['runs'] else 'not run'}")
             continue
-        rates = [median(summaries, rate) for rate in RATES]
+        rates = [_of_all(summaries, rate) for rate in RATES]
         first = first or rates[-1]
         shown = " ".join(f"{rate:10,.0f}" for rate in rates)
-        final = median(summaries, "final_return")
-        memory = median([summary["device"] for summary in summaries], "peak_memory_mib")
+        memory = _of_all([summary["device"] for summary in summaries], "peak_memory_mib")
         trained = [summary["step_per_s_train"] for summary in summaries]
         spread = (max(trained) - min(trained)) / rates[-1]
         rows.append(
-            f"{name:32} {shown} {spread:6.1%} {rates[-1] / first:6.2f} {final:8,.0f} "
-            f"{memory:7,.0f}"
+            f"{name:32} {shown} {spread:6.1%} {rates[-1] / first:6.2f} "
+            f"{_of_all(summaries, 'final_return'):8,.0f} {memory:7,.0f}"
         )
     return "\n".join(rows)
 
 
-def median(summaries: list[dict[str, Any]], key: str) -> float:
-    """Median of a figure over runs, NaN where it was not measured."""
-    values = [summary[key] for summary in summaries if summary.get(key) is not None]
-    return statistics.median(values) if len(values) == len(summaries) else math.nan
+def _of_all(summaries: Sequence[Mapping[str, Any]], key: str) -> float:
+    """Median of a figure over runs, NaN where one has none."""
+    values: list[Any] = [summary.get(key) for summary in summaries]
+    return math.nan if None in values else statistics.median(values)
+
+
+def _options() -> argparse.Namespace:
+    parser = options("run", __doc__)
+    parser.epilog = f"suites: {', '.join(sorted(SUITES))}"
+    parser.add_argument("suites", nargs="+", choices=sorted(SUITES), metavar="SUITE")
+    parser.add_argument("--only", default="", metavar="TEXT", help="cases with TEXT in the name")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--gpus", type=int, help="run cases at the same time on so many GPUs")
+    parser.add_argument("--runs", type=Path, help="keep the run folders here")
+    parser.add_argument("--resume", action="store_true", help="add to the runs in the JSON file")
+    return parser.parse_args()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -14,11 +14,8 @@ its runs that are through are kept.
 from __future__ import annotations
 
 import argparse
-import json
-import math
 import re
 import shlex
-import signal
 import sys
 import tempfile
 import time
@@ -27,10 +24,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gmijax
-from benchmarks.command import run_command
 from benchmarks.outcomes import Outcome, against, outcome_of, summary
-from benchmarks.played import FILE
-from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
+from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.runner import deadline, exit_code, in_turn, options, run_command
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
@@ -40,7 +36,7 @@ class Row(NamedTuple):
     """A setting: its name, and what it changes."""
 
     name: str
-    overrides: Sequence[str]
+    overrides: tuple[str, ...]
 
     @property
     def folder(self) -> str:
@@ -57,66 +53,44 @@ def row_of(text: str) -> Row:
 class Benchmark:
     """The rows of one call, in its file after each of them."""
 
-    def __init__(self, arguments: argparse.Namespace, task: str) -> None:
-        self._arguments, self._task = arguments, task
-        self._deadline_s = time.monotonic() + (arguments.deadline_s or math.inf)
-        path = arguments.out / file_name(f"seeds-{task}", device_name())
-        self.file = ResultsFile(path, "seeds", vars(arguments))
+    def __init__(self, given: argparse.Namespace, task: str) -> None:
+        self._given, self._task = given, task
+        self._deadline_s = deadline(given.deadline_s)
+        path = given.out / file_name(f"seeds-{task}", device_name())
+        self.file = ResultsFile(path, "seeds", vars(given))
         self.rows: list[dict[str, Any]] = []
         self._baseline: Sequence[Outcome] = ()
 
-    def analyse(self, folder: Path) -> None:
-        """Adds a sweep that is there."""
-        self._add(folder.name, folder, {"folder": str(folder)})
-
     def run(self, rows: Sequence[Row]) -> None:
         """Every row that there is time for; a row is expected to take as long as one before."""
-        longest_s = 0.0
-        for row in rows:
-            if time.monotonic() + longest_s > self._deadline_s:
-                break
+        for _, row in in_turn(rows, 1, self._deadline_s, like=lambda _: "any"):
             with tempfile.TemporaryDirectory() as scratch:
-                folder = (self._arguments.runs or Path(scratch)) / row.folder
-                longest_s = max(longest_s, self._sweep(row, folder))
+                self._sweep(row, (self._given.runs or Path(scratch)) / row.folder)
 
-    def _sweep(self, row: Row, folder: Path) -> float:
-        """Trains a row and writes it down, what is through too if it is interrupted; seconds."""
-        started_s, code, own = time.monotonic(), 130, {}
-        if self._arguments.play:
-            (folder / FILE).unlink(missing_ok=True)  # Of an earlier call.
-        try:
-            code = run_command(self._command(row, folder), self._deadline_s)
-            if self._arguments.play and code in (0, 1):  # 1: a job failed; the others are there.
-                own["play_code"] = run_command(self._play(folder), self._deadline_s)
-        finally:
-            seconds = round(time.monotonic() - started_s, 2)
-            if (folder / "sweep.json").exists():
-                own |= {"overrides": row.overrides, "code": code, "command_s": seconds}
-                self._add(row.name, folder, own)
-                with self.file.changing() as results:
-                    results.update(task=self._task, rows=self.rows)
-        if not (folder / "sweep.json").exists():
-            raise SystemExit(f"row {row.name}: no result of its sweep (exit code {code})")
-        return seconds
-
-    def _command(self, row: Row, folder: Path) -> list[str]:
-        arguments = self._arguments
-        return [
+    def _sweep(self, row: Row, folder: Path) -> None:
+        """Trains a row and writes it down, what is through too if it is interrupted."""
+        given, started_s, code = self._given, time.monotonic(), 130
+        command = [
             *(sys.executable, "-m", "gmijax.sweep", "run.measure_throughput=false"),
-            *(*arguments.overrides, *row.overrides, f"seed=range({arguments.seeds})"),
-            *(f"sweep.jobs_per_gpu={arguments.at_once}", f"sweep.pack={arguments.pack}"),
+            *(*given.overrides, *row.overrides, f"seed=range({given.seeds})"),
+            *(f"sweep.jobs_per_gpu={given.at_once}", f"sweep.pack={given.pack}"),
             f"run.dir={folder}",
         ]
+        try:
+            code = run_command(command, self._deadline_s)
+        finally:
+            if (folder / "sweep.json").exists():
+                seconds = round(time.monotonic() - started_s, 2)
+                self._add(row, folder, {"code": code, "command_s": seconds})
+        if not (folder / "sweep.json").exists():
+            raise SystemExit(f"row {row.name}: no result of its sweep (exit code {code})")
 
-    def _play(self, folder: Path) -> list[str]:
-        episodes = ("--episodes", str(self._arguments.play))
-        return [sys.executable, "-m", "benchmarks.played", str(folder), *episodes]
-
-    def _add(self, name: str, folder: Path, own: Mapping[str, Any]) -> None:
+    def _add(self, row: Row, folder: Path, own: Mapping[str, Any]) -> None:
         report = read_json(folder / "sweep.json")
         outcomes, unfinished = outcomes_of(self._task, folder, report)
-        row = {
-            "row": name,
+        found = {
+            "row": row.name,
+            "overrides": row.overrides,
             **own,
             "status": report["status"],
             "trainings_per_hour": report["trainings_per_hour"],
@@ -124,11 +98,13 @@ class Benchmark:
             **summary(outcomes),
         }
         if self.rows:
-            row |= against(outcomes, self._baseline)
+            found |= against(outcomes, self._baseline)
         else:
             self._baseline = outcomes
-        self.rows.append({**row, "each": [one._asdict() for one in outcomes]})
-        sys.stdout.write(f"{told(row)}\n")
+        self.rows.append({**found, "each": [one._asdict() for one in outcomes]})
+        with self.file.changing() as results:
+            results.update(task=self._task, rows=self.rows)
+        sys.stdout.write(f"{line(found)}\n")
         sys.stdout.flush()
 
 
@@ -141,7 +117,6 @@ def outcomes_of(task: str, folder: Path, report: Mapping[str, Any]) -> tuple[lis
       report: its `sweep.json`.
     """
     ended = [job for job in report["jobs"] if job["state"] in ("completed", "failed")]
-    played = read_json(folder / FILE) if (folder / FILE).exists() else {}
     outcomes = [
         outcome_of(
             task,
@@ -149,14 +124,13 @@ def outcomes_of(task: str, folder: Path, report: Mapping[str, Any]) -> tuple[lis
             seed=str(job["overrides"].get("seed")),
             completed=job["state"] == "completed",
             wall_s=job["wall_s"],
-            played=played.get(Path(job["run_dir"]).name, {}),
         )
         for job in ended
     ]
     return outcomes, len(report["jobs"]) - len(ended)
 
 
-def told(row: Mapping[str, Any]) -> str:
+def line(row: Mapping[str, Any]) -> str:
     """A row in one line."""
     if not row["seeds"]:
         return f"{row['row']}: no training has ended"
@@ -164,83 +138,49 @@ def told(row: Mapping[str, Any]) -> str:
     text = f"{row['row']}: {row['successes']} of {row['seeds']} ({low:.0%} to {high:.0%})"
     for name in ("final", "peak", "return"):
         if row[name]:
-            text += f", {name} {_spread(row[name])}"
-    for name, quartiles in row["at_end"].items():
-        if name.startswith("played/"):
-            text += f", {name} {_spread(quartiles)}"
+            low, middle, high = row[name]
+            text += f", {name} {middle:.4g} ({low:.4g} to {high:.4g})"
     if row.get("p_final") is not None:
         text += f"; p {row['p_successes']} for successes, {row['p_final']} for final rewards"
     return text
 
 
-def _spread(quartiles: Sequence[float]) -> str:
-    low, middle, high = quartiles
-    return f"{middle:.4g} ({low:.4g} to {high:.4g})"
-
-
 def main() -> int:
-    """Trains what the command line asks for; returns 1 if a job failed, 2 on bad input, else 0."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    arguments = _arguments()
-    rows = [row_of(text) for text in arguments.row]
-    try:
-        benchmark = Benchmark(arguments, checked(arguments, rows))
-        for folder in arguments.analyse:
-            benchmark.analyse(folder)
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
-    try:
-        benchmark.run(rows)
-    except KeyboardInterrupt:
-        return 130
-    if not rows:
-        sys.stdout.write(f"{json.dumps(benchmark.rows)}\n")
+    """Trains what the command line asks for; returns 1 if a job failed, else 0."""
+    given = _options()
+    rows = [row_of(text) for text in given.row]
+    benchmark = Benchmark(given, checked(given.overrides, rows))
+    benchmark.run(rows)
     return int(any(row["status"] == "failed" for row in benchmark.rows))
 
 
-def checked(arguments: argparse.Namespace, rows: Sequence[Row]) -> str:
+def checked(overrides: Sequence[str], rows: Sequence[Row]) -> str:
     """The name of the task.
 
     Raises:
-      ConfigError: a setting that is not one, two rows of one name, no such sweep, nothing to do.
+      ConfigError: a setting that is not one, two rows of one name.
     """
-    config = gmijax.compose(*arguments.overrides)
+    config = gmijax.compose(*overrides)
     for row in rows:
-        gmijax.compose(*arguments.overrides, *row.overrides)
+        gmijax.compose(*overrides, *row.overrides)
     folders = [row.folder for row in rows]
     if twice := [row.name for row in rows if folders.count(row.folder) > 1]:
         raise ConfigError(f"--row {twice[0]}: two rows have this name")
-    for folder in arguments.analyse:
-        if not (folder / "sweep.json").exists():
-            raise ConfigError(f"--analyse {folder}: has no sweep.json")
-    if not rows and not arguments.analyse:
-        raise ConfigError("nothing to do: expected --row or --analyse")
     return config.env.slug
 
 
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def _options() -> argparse.Namespace:
+    parser = options("seeds", __doc__)
     parser.add_argument("overrides", nargs="*", help="of all runs, e.g. env=ant")
     parser.add_argument(
         "--row",
         action="append",
-        default=[],
+        required=True,
         metavar="'NAME: OVERRIDE ...'",
         help="a setting; the first one is the baseline",
     )
     parser.add_argument("--seeds", type=int, default=20, help="runs of a row")
     parser.add_argument("--at-once", default="8", help="runs at once on every GPU, or auto")
-    parser.add_argument(
-        "--play",
-        type=int,
-        default=0,
-        metavar="EPISODES",
-        help="of the last and the best checkpoint of every run, without noise; see "
-        "run.checkpoint_every",
-    )
     parser.add_argument(
         "--pack", default="gmi", choices=["gmi", "auto"], help="sweep.pack: auto is one program"
     )
@@ -248,18 +188,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--runs", type=Path, help="keep the sweeps here, and go on with those that are there"
     )
-    parser.add_argument(
-        "--analyse",
-        type=Path,
-        nargs="*",
-        default=[],
-        metavar="FOLDER",
-        help="rows of sweeps that are there, before those that are run; the first one is then "
-        "the baseline",
-    )
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
     return parser.parse_intermixed_args()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -9,17 +9,17 @@ medians of the stages of one dedicated step of all environments of a GMI.
 from __future__ import annotations
 
 import argparse
-import json
-import os
+import itertools
 import statistics
-import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
+from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.runner import as_word, exit_code, failure_of, in_turn, options
+from gmijax.runs.folder import RunPaths, read_json
 
 Summary = Mapping[str, Any]
 
@@ -44,45 +44,47 @@ class Setting(NamedTuple):
         """What tables call it."""
         return f"{self.task} {self.simulators} x {self.num_envs}, {self.backend}"
 
+    def command(self, given: argparse.Namespace, template: str, name: str) -> list[str]:
+        """One job, whose run has this name."""
+        gmis = self.simulators + (template == "tdg")
+        steps = self.simulators * self.num_envs * given.unroll_length * given.unrolls
+        return [
+            *(sys.executable, "-m", "gmijax.serve", f"env={self.task}", "policy=random"),
+            *(f"num_envs={self.num_envs}", f"num_timesteps={steps}"),
+            *(f"unroll_length={given.unroll_length}", f"plan.gmis_per_gpu={gmis}"),
+            *(f"plan.template={template}", f"plan.backend={self.backend}"),
+            *(f"physics.impl={given.impl}", f"run.name={name}"),
+        ]
+
 
 def main() -> int:
     """Measures what the command line asks for; returns 1 if a job failed, else 0."""
-    arguments = _arguments()
-    path = arguments.out / file_name("serving", device_name())
-    book = ResultsFile(path, "serving", vars(arguments))
+    given = _options()
+    file = ResultsFile(given.out / file_name("serving", device_name()), "serving", vars(given))
     cases: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory() as scratch:
-        for setting in settings(arguments):
-            cases.append(measure(setting, arguments, Path(scratch)))
-            sys.stdout.write(f"{line(cases[-1])}\n")
-            sys.stdout.flush()
-            with book.changing() as results:
-                results["cases"] = cases
+    for task, backend, m in itertools.product(given.tasks, given.backends, given.simulators):
+        # The environments of a task are split over its simulators.
+        cases.append(measure(Setting(task, backend, m, given.envs // m), given))
+        sys.stdout.write(f"{line(cases[-1])}\n")
+        sys.stdout.flush()
+        with file.changing() as results:
+            results["cases"] = cases
     return int(any("failed" in case for case in cases))
 
 
-def settings(arguments: argparse.Namespace) -> Iterator[Setting]:
-    """All combinations; the environments of a task are split over its simulators."""
-    for task in arguments.tasks:
-        for backend in arguments.backends:
-            for simulators in arguments.simulators:
-                yield Setting(task, backend, simulators, arguments.envs // simulators)
-
-
-def measure(setting: Setting, arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
+def measure(setting: Setting, given: argparse.Namespace) -> dict[str, Any]:
     """Both templates in turn, as often as wanted; a case of the file.
 
     Throughputs and times are medians over the repeats; every repeat's summary is kept.
     """
     runs: dict[str, list[Summary]] = {"tcg": [], "tdg": []}
-    for repeat in range(arguments.repeats):
-        for template in arguments.templates:
-            name = f"{setting.name.replace(', ', ' ').replace(' ', '-')}-{template}-{repeat}"
-            try:
-                runs[template].append(serve(setting, template, arguments, scratch, name))
-            except RuntimeError as error:
-                sys.stderr.write(f"{setting.name}, {template}: {error}\n")
-                return {"name": setting.name, "failed": str(error)}
+    with tempfile.TemporaryDirectory() as scratch:
+        for repeat, template in in_turn(given.templates, given.repeats):
+            name = f"{as_word(setting.name)}-{template}-{repeat}"
+            if failure := failure_of(setting.command(given, template, name), Path(scratch)):
+                sys.stderr.write(f"{setting.name}, {template}: {failure}\n")
+                return {"name": setting.name, "failed": failure}
+            runs[template].append(read_json(RunPaths(Path(scratch) / "runs" / name).summary))
     first = next(found[0] for found in runs.values() if found)
     case: dict[str, Any] = {"name": setting.name, **setting._asdict(), "impl": first.get("impl")}
     case["runs"] = runs
@@ -90,44 +92,13 @@ def measure(setting: Setting, arguments: argparse.Namespace, scratch: Path) -> d
         if runs[template]:
             case[name] = statistics.median(run["step_per_s_inference"] for run in runs[template])
     if runs["tdg"]:
-        stages = {
-            name: statistics.median(run["stages_ms"][name]["p50"] / 1e3 for run in runs["tdg"])
+        simulate, infer, exchange = (
+            statistics.median(run["stages_ms"][name]["p50"] / 1e3 for run in runs["tdg"])
             for name in ("simulate", "infer", "exchange")
-        }
-        case |= {
-            "simulator_s": stages["simulate"],
-            "agent_s": stages["infer"],
-            # Pipes, copies between host and device, and waiting for the agent's turn.
-            "com_s": stages["exchange"] - stages["infer"],
-        }
+        )
+        # COM: pipes, copies between host and device, and waiting for the agent's turn.
+        case |= {"simulator_s": simulate, "agent_s": infer, "com_s": exchange - infer}
     return case
-
-
-def serve(
-    setting: Setting, template: str, arguments: argparse.Namespace, scratch: Path, name: str
-) -> Summary:
-    """Runs one job; returns its summary. Raises RuntimeError with what it said if it fails."""
-    gmis = setting.simulators + (template == "tdg")
-    steps = setting.simulators * setting.num_envs * arguments.unroll_length * arguments.unrolls
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "gmijax.serve", f"env={setting.task}", "policy=random"),
-            *(f"num_envs={setting.num_envs}", f"num_timesteps={steps}"),
-            *(f"unroll_length={arguments.unroll_length}", f"plan.gmis_per_gpu={gmis}"),
-            *(f"plan.template={template}", f"plan.backend={setting.backend}"),
-            *(f"physics.impl={arguments.impl}", f"run.name={name}"),
-        ],
-        cwd=scratch,
-        env=_environment(),
-        check=False,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    if done.returncode != 0:
-        said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-        raise RuntimeError(said[-1])
-    return json.loads((scratch / "runs" / name / "summary.json").read_text())
 
 
 def line(case: Mapping[str, Any]) -> str:
@@ -145,8 +116,8 @@ def line(case: Mapping[str, Any]) -> str:
     return "  ".join(parts)
 
 
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
+def _options() -> argparse.Namespace:
+    parser = options("serving", __doc__)
     parser.add_argument("--tasks", nargs="+", default=["ant", "humanoid"], metavar="TASK")
     parser.add_argument("--backends", nargs="+", default=["auto"], metavar="BACKEND")
     parser.add_argument("--templates", nargs="+", default=["tcg", "tdg"], choices=["tcg", "tdg"])
@@ -156,15 +127,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--unroll-length", type=int, default=32)
     parser.add_argument("--unrolls", type=int, default=20, help="unrolls of every GMI")
     parser.add_argument("--repeats", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
     return parser.parse_args()
 
 
-def _environment() -> dict[str, str]:
-    checkout = str(Path(__file__).resolve().parent.parent)
-    path = os.pathsep.join(filter(None, (checkout, os.environ.get("PYTHONPATH"))))
-    return {**os.environ, "PYTHONPATH": path}
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

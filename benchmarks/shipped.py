@@ -1,10 +1,11 @@
 r"""Trains the policies that gmijax ships: `python -m benchmarks.shipped`.
 
-All tasks are trained at the same time on one GPU, each with its tuned settings but for those of
-`RECIPES`. The checkpoint with the best evaluation becomes `gmijax/player/policies/<task>.npz`,
-its weights in float16. `benchmarks/results/shipped-<device>.json` says what it was made with and
-what it returns: in MJX, as evaluated while it was trained (128 episodes with float32 weights), and
-in plain MuJoCo, as the file is.
+All tasks are trained at the same time on one GPU, as one sweep, each with its tuned settings but
+for those of `RECIPES`. The checkpoint with the best evaluation becomes
+`gmijax/player/policies/<task>.npz`, its weights in float16.
+`benchmarks/results/shipped-<device>.json` says what it was made with and what it returns: in MJX,
+as evaluated while it was trained (128 episodes with float32 weights), and in plain MuJoCo, as the
+file is.
 
     python -m benchmarks.shipped --deadline-s 470
 
@@ -16,39 +17,42 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import multiprocessing
+import os
+import signal
 import sys
 import tempfile
-import time
-from collections.abc import Iterator, Mapping, Sequence
+import threading
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.command import start, wait_until
-from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
-from gmijax.machine.mps_control import DEFAULT_PIPE_DIRECTORY, MpsControl
-from gmijax.machine.snapshot import Machine, detect_machine
+from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.runner import STOP_S, exit_code, options
+from gmijax.cli.compose import compose
+from gmijax.errors import JobInterrupted, SweepFailed
 from gmijax.player.policy import read_policy, write_policy
 from gmijax.player.returns import Played, play
 from gmijax.player.shipped import POLICIES
 from gmijax.runs.folder import POLICY, RunPaths, read_json
 from gmijax.runs.history import read_metrics
 from gmijax.runs.resume import CheckpointMeta, best_checkpoint
+from gmijax.sweeps.sweep import sweep
 
 SEED = 0
-MEMORY = 0.65
-"""Of the GPU's, which trainings reserve together; MJX-Warp takes more beside it."""
+PLACES = 8
+"""Of the sweep on the GPU, more than there are tasks: MJX-Warp takes memory beside its place."""
 
 AT_ONCE = 8
 """Episodes in plain MuJoCo that a process plays one after the other."""
 
 OF_SUMMARY = ("status", "wall_s", "train_wall_s", "compile_s", "env_steps_per_s", "impl", "device")
 
-THROUGH = (0, 130)
-"""Exit codes of trainings that have saved, the last one at the deadline."""
+CODES = {"completed": 0, "interrupted": 130}
+"""States of trainings that have saved, the last one at the deadline."""
 
 EVALUATIONS = 5
 """Of a training; the best one's checkpoint is shipped."""
@@ -74,70 +78,46 @@ RECIPES: Mapping[str, Recipe] = {
 
 def main() -> int:
     """Trains and evaluates; returns 1 if a training failed."""
-    given = _arguments()
-    path = given.out / file_name("shipped", device_name())
-    file = ResultsFile(path, "shipped", vars(given))
+    given = _options()
+    file = ResultsFile(given.out / file_name("shipped", device_name()), "shipped", vars(given))
     code = 0
     if not given.only_evaluate:
         with tempfile.TemporaryDirectory() as scratch:
-            code = train(given, given.runs or Path(scratch), file)
+            code = train(given, given.runs or Path(scratch) / "sweep", file)
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
         for task in given.tasks:
             evaluate(task, given, file, pool)
     return code
 
 
-def train(given: argparse.Namespace, runs: Path, file: ResultsFile) -> int:
+def train(given: argparse.Namespace, root: Path, file: ResultsFile) -> int:
     """Trains all at once, and keeps the policies of those that are through."""
-    deadline_s = time.monotonic() + given.deadline_s
-    runs.mkdir(parents=True, exist_ok=True)
-    with _shared_gpu(detect_machine(), runs) as own:
-        started = []
-        for task in given.tasks:
-            with (runs / f"{task}.log").open("wb") as log:
-                started.append(start(command(task, given, runs, own), {}, log))
-        codes = wait_until(deadline_s, *started)
-    for task, code in zip(given.tasks, codes, strict=True):
-        if code in THROUGH:
-            keep(task, code, runs / task, given, file)
+    configs = [compose(*overrides(task, given), f"run.dir={root}") for task in given.tasks]
+    # All save and end then. A sweep that has failed jobs has run the others.
+    alarm = threading.Timer(given.deadline_s - STOP_S, os.kill, (os.getpid(), signal.SIGTERM))
+    alarm.start()
+    with suppress(JobInterrupted, SweepFailed):
+        sweep(configs, jobs_per_gpu=PLACES, gpus=1)
+    alarm.cancel()
+    code = 0
+    for task, job in zip(given.tasks, read_json(root / "sweep.json")["jobs"], strict=True):
+        if job["state"] in CODES:
+            keep(task, CODES[job["state"]], Path(job["run_dir"]), given, file)
         else:
-            sys.stdout.write(f"{task}: failed (exit code {code}), see {runs / task}.log\n")
-            sys.stdout.write((runs / f"{task}.log").read_text(errors="replace")[-2000:])
-    return int(any(code not in THROUGH for code in codes))
+            sys.stdout.write(f"{task}: {job['state']}, see {job['run_dir']}: {job['error']}\n")
+            code = 1
+    return code
 
 
-def command(task: str, given: argparse.Namespace, runs: Path, own: Sequence[str]) -> Sequence[str]:
+def overrides(task: str, given: argparse.Namespace) -> Sequence[str]:
     """The training of a task."""
     recipe = RECIPES[task]
     steps = max(1, int(recipe.steps * given.scale))
     return [
-        *(sys.executable, "-m", "gmijax.train", f"env={task}", f"num_timesteps={steps}"),
-        *(f"seed={SEED}", f"run.dir={runs / task}", "run.measure_throughput=false"),
+        *(f"env={task}", f"num_timesteps={steps}", f"seed={SEED}", "run.measure_throughput=false"),
         *(f"eval.every={-(-steps // EVALUATIONS)}", "run.checkpoint_every=0"),
-        *(*recipe.overrides, *own, *given.overrides),
+        *(*recipe.overrides, *given.overrides),
     ]
-
-
-@contextmanager
-def _shared_gpu(machine: Machine, runs: Path) -> Iterator[Sequence[str]]:
-    """Keys for trainings that share a GPU, under one MPS daemon where there is one to start."""
-    if not machine.gpus:
-        yield []
-        return
-    share = f"plan.memory_fraction={MEMORY / len(RECIPES):.2f}"
-    gpu = machine.gpus[0]
-    if machine.mps_control is None:
-        yield [share, "plan.backend=share"]
-        return
-    if machine.daemon_of(gpu.uuid) is not None:
-        yield [share, "plan.backend=mps"]
-        return
-    daemon = MpsControl(machine.mps_control, DEFAULT_PIPE_DIRECTORY)
-    daemon.start(gpu.uuid, runs / "mps")
-    try:
-        yield [share, "plan.backend=mps"]
-    finally:
-        daemon.quit()
 
 
 def keep(
@@ -162,7 +142,7 @@ def keep(
     write_policy(path, dataclasses.replace(policy, about=about), half=True)
     with file.changing() as results:
         results[task] = {
-            "overrides": list(command(task, given, Path("runs"), ())[3:]),
+            "overrides": overrides(task, given),
             "code": code,
             "env_steps": steps,
             **{name: summary.get(name) for name in OF_SUMMARY},
@@ -212,21 +192,18 @@ def _play(path: Path, seed: int) -> list[Played]:
     return list(play(read_policy(path), AT_ONCE, seed))
 
 
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def _options() -> argparse.Namespace:
+    parser = options("shipped", __doc__)
     parser.add_argument("overrides", nargs="*", help="of all trainings, e.g. physics.impl=jax")
     parser.add_argument("--tasks", nargs="+", default=list(RECIPES), choices=list(RECIPES))
     parser.add_argument("--scale", type=float, default=1.0, help="factor on all steps")
     parser.add_argument("--episodes", type=int, default=128, help="in plain MuJoCo")
     parser.add_argument("--deadline-s", type=float, default=3600.0, help="for the trainings")
     parser.add_argument("--only-evaluate", action="store_true", help="train nothing")
-    parser.add_argument("--runs", type=Path, help="keep the run folders here")
+    parser.add_argument("--runs", type=Path, help="keep the sweep here")
     parser.add_argument("--policies", type=Path, default=POLICIES, help="where policies go")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
     return parser.parse_intermixed_args()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -26,6 +26,17 @@ def curve_of(row: Mapping[str, Any]) -> Curve | None:
     return np.array(seconds), np.array([line["env_steps"] for line in lines])
 
 
+def are_alike(jobs: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether jobs of a `pack.json` are of one kind: those that completed made as many steps."""
+    steps = [job["env_steps"] for job in jobs if job["state"] == "completed"]
+    return not steps or max(steps) <= 1.5 * min(steps)
+
+
+def rate_of_jobs(jobs: Sequence[Mapping[str, Any]]) -> float | None:
+    """Steps per second of all jobs of a pack together; None of a mix, whose sum says nothing."""
+    return sum(job["env_steps_per_s"] or 0.0 for job in jobs) if are_alike(jobs) else None
+
+
 def settled_rate(curve: Sequence[tuple[float, int]]) -> float | None:
     """Steps per second after the first fifth of one run, which holds compilation.
 

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
-import signal
 import statistics
 import sys
 import tempfile
@@ -22,10 +20,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.command import STOP_S, run_command
-from benchmarks.records import RESULTS, ResultsFile, file_name
+from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.runner import deadline, exit_code, in_turn, options, run_command
 from benchmarks.steady import curve_of, steady_rate
-from gmijax.machine.snapshot import Machine, detect_machine
+from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import read_json
 
 
@@ -34,7 +32,7 @@ class Way(NamedTuple):
 
     at_once: str  # Jobs on the GPU, or `auto`.
     how: str  # `plan.backend`, or `vmap`: those that can be are one program.
-    tasks: str  # Tasks of a mix, with commas; empty: that of the command line.
+    tasks: str = ""  # Tasks of a mix, with commas; empty: that of the command line.
 
     @property
     def is_one_program(self) -> bool:
@@ -44,11 +42,8 @@ class Way(NamedTuple):
     @property
     def compiling(self) -> Way:
         """A way that compiles the same programs: a job of each task beside the others."""
-        return (
-            self
-            if self.is_one_program
-            else Way(str(1 + self.tasks.count(",")), "auto", self.tasks)
-        )
+        each = str(1 + self.tasks.count(","))
+        return self if self.is_one_program else Way(each, "auto", self.tasks)
 
     def __str__(self) -> str:
         return f"{self.at_once} at once, {self.how}{', ' * bool(self.tasks)}{self.tasks}"
@@ -57,88 +52,76 @@ class Way(NamedTuple):
 class Benchmark:
     """The sweeps of one call, in its file after each of them."""
 
-    def __init__(self, arguments: argparse.Namespace, machine: Machine) -> None:
-        self._arguments = arguments
-        device = machine.gpus[0].name if machine.gpus else "cpu"
-        path = arguments.out / file_name("sweeps", device)
-        self.file = ResultsFile(path, "sweeps", vars(arguments))
-        self.deadline_s = time.monotonic() + (arguments.deadline_s or math.inf)
+    def __init__(self, given: argparse.Namespace) -> None:
+        self._given = given
+        path = given.out / file_name("sweeps", device_name())
+        self.file = ResultsFile(path, "sweeps", vars(given))
+        self._deadline_s = deadline(given.deadline_s)
         self.runs: list[dict[str, Any]] = []
 
     def run(self, ways: Sequence[Way]) -> None:
         """Every way as often as wanted, all of them once before one comes twice."""
         with tempfile.TemporaryDirectory() as scratch:
-            cache = Path(scratch) / "xla" if self._arguments.warm else None
+            cache = Path(scratch) / "xla" if self._given.warm else None
             if cache is not None:
                 for way in dict.fromkeys(way.compiling for way in ways):
-                    self._sweep(way, 0, cache, ("num_timesteps=1",))
-            for repeat in range(self._arguments.repeats):
-                for way in ways:
-                    if self._has_time(way):
-                        self.runs.append(self._sweep(way, repeat, cache))
-                        sys.stdout.write(f"{json.dumps(self.runs[-1])}\n")
-                        sys.stdout.flush()
-                        with self.file.changing() as results:
-                            results.update(medians=self.medians(ways), runs=self.runs)
+                    self._sweep(way, cache, ("num_timesteps=1",))
+            for repeat, way in in_turn(ways, self._given.repeats, self._deadline_s):
+                row = {"way": str(way), "repeat": repeat, **self._sweep(way, cache)}
+                self.runs.append(row)
+                sys.stdout.write(f"{json.dumps(row)}\n")
+                sys.stdout.flush()
+                with self.file.changing() as results:
+                    results.update(medians=self.medians(ways), runs=self.runs)
 
     def medians(self, ways: Sequence[Way]) -> dict[str, dict[str, Any]]:
         """Of the sweeps that are through, by way."""
         found: dict[str, dict[str, Any]] = {}
-        for way in ways:
-            own = [run for run in self.runs if run["way"] == str(way)]
-            if done := [run for run in own if run["status"] == "completed"]:
-                rates = [run["trainings_per_hour"] for run in done]
+        for way in map(str, ways):
+            of_way = [run for run in self.runs if run["way"] == way]
+            if done := [run for run in of_way if run["status"] == "completed"]:
                 steady = [rate for run in done if (rate := run["steady_steps_per_s"])]
-                found[str(way)] = {
+                found[way] = {
                     "sweeps": len(done),
-                    "trainings_per_hour": statistics.median(rates),
+                    "trainings_per_hour": statistics.median(
+                        run["trainings_per_hour"] for run in done
+                    ),
                     # Never, where runs are too short to overlap.
                     "steady_steps_per_s": statistics.median(steady) if steady else None,
                 }
         return found
 
-    def _has_time(self, way: Way) -> bool:
-        before = [run["command_s"] for run in self.runs if run["way"] == str(way)]
-        return time.monotonic() + max(before, default=0.0) < self.deadline_s - STOP_S
-
-    def _sweep(
-        self, way: Way, repeat: int, cache: Path | None, more: Sequence[str] = ()
-    ) -> dict[str, Any]:
+    def _sweep(self, way: Way, cache: Path | None, more: Sequence[str] = ()) -> dict[str, Any]:
         """One sweep as a whole command."""
         tasks = way.tasks.split(",") if way.tasks else []
         is_one_each = more and not way.is_one_program
-        seeds = 1 if is_one_each else max(1, self._arguments.jobs // max(1, len(tasks)))
+        seeds = 1 if is_one_each else max(1, self._given.jobs // max(1, len(tasks)))
         with tempfile.TemporaryDirectory() as scratch:
             folder = Path(scratch) / "sweep"
-            command = [sys.executable, "-m", "gmijax.sweep", "run.measure_throughput=false"]
-            command += [
-                *self._arguments.overrides,
-                *([f"env={way.tasks}"] if tasks else []),
-                *more,
+            command = [
+                *(sys.executable, "-m", "gmijax.sweep", "run.measure_throughput=false"),
+                *(*self._given.overrides, *([f"env={way.tasks}"] if tasks else []), *more),
+                *(f"seed=range({seeds})", f"sweep.jobs_per_gpu={way.at_once}"),
+                "sweep.pack=vmap" if way.is_one_program else f"plan.backend={way.how}",
+                *("sweep.gpus=1", f"run.dir={folder}"),
             ]
-            command += [f"seed=range({seeds})", f"sweep.jobs_per_gpu={way.at_once}"]
-            command.append("sweep.pack=vmap" if way.is_one_program else f"plan.backend={way.how}")
-            command += ["sweep.gpus=1", f"run.dir={folder}"]
             started_s = time.monotonic()
             variables = {"JAX_COMPILATION_CACHE_DIR": str(cache or Path(scratch) / "xla")}
-            code = run_command(command, self.deadline_s, variables)
+            code = run_command(command, self._deadline_s, variables)
             command_s = round(time.monotonic() - started_s, 2)
             if not (folder / "sweep.json").exists():
                 raise SystemExit(f"no result of {' '.join(command)}")
             report = read_json(folder / "sweep.json")
             curves = [curve for row in report["jobs"] if (curve := curve_of(row))]
         jobs, each = report["jobs"], report["sweep"]["jobs_per_gpu"]
+        steady = steady_rate(curves, min(each, len(jobs))) if isinstance(each, int) else None
         return {
-            "way": str(way),
-            "repeat": repeat,
             "status": report["status"],
             "code": code,
             "jobs_per_gpu": each,
             "command_s": command_s,
             "trainings_per_hour": report["trainings_per_hour"],
-            "steady_steps_per_s": steady_rate(curves, min(each, len(jobs)))
-            if isinstance(each, int)
-            else None,
+            "steady_steps_per_s": steady,
             "first_update_s": [job["first_update_s"] for job in jobs],
             "job_wall_s": [job["wall_s"] for job in jobs],
             "values": [job["value"] for job in jobs],
@@ -148,42 +131,30 @@ class Benchmark:
 
 def main() -> int:
     """Measures what the command line asks for; returns 1 if a sweep failed, else 0."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    arguments, machine = _arguments(), detect_machine()
-    shared = arguments.shared if machine.gpus else []
-    ways = [Way(str(n), "auto", arguments.mix) for n in arguments.at_once]
-    ways += [Way(str(n), "share", arguments.mix) for n in shared]
-    ways += [Way(str(n), "vmap", arguments.mix) for n in arguments.packed]
-    if arguments.auto:
-        ways.append(Way("auto", "auto", arguments.mix))
-    benchmark = Benchmark(arguments, machine)
-    code = 0
+    given = _options()
+    counts = {
+        "auto": given.at_once,
+        "share": given.shared if detect_machine().gpus else [],
+        "vmap": given.packed,
+    }
+    ways = [Way(str(n), how, given.mix) for how, found in counts.items() for n in found]
+    ways += [Way("auto", "auto", given.mix)] if given.auto else []
+    benchmark = Benchmark(given)
     try:
         benchmark.run(ways)
-    except KeyboardInterrupt:
-        code = 130
-    medians = benchmark.medians(ways)
-    for way, row in medians.items():
-        steady = row["steady_steps_per_s"]
-        shown = "-" if steady is None else f"{steady:,.0f}"
-        sys.stdout.write(
-            f"{way}: {row['trainings_per_hour']:.1f} runs/h, {shown} steps/s while all "
-            f"places train ({row['sweeps']} sweeps)\n"
-        )
-    if arguments.auto and (share := _auto_to_best(medians)) is not None:
-        sys.stdout.write(f"auto makes {share:.0%} of the runs of the best of the others\n")
-    return code or int(any(run["status"] == "failed" for run in benchmark.runs))
+    finally:
+        for way, row in benchmark.medians(ways).items():
+            steady = row["steady_steps_per_s"]
+            shown = "-" if steady is None else f"{steady:,.0f}"
+            sys.stdout.write(
+                f"{way}: {row['trainings_per_hour']:.1f} runs/h, {shown} steps/s while all "
+                f"places train ({row['sweeps']} sweeps)\n"
+            )
+    return int(any(run["status"] == "failed" for run in benchmark.runs))
 
 
-def _auto_to_best(medians: dict[str, dict[str, Any]]) -> float | None:
-    rates = {way: row["trainings_per_hour"] for way, row in medians.items()}
-    auto = rates.pop(str(Way("auto", "auto", "")), None)
-    others = [rate for way, rate in rates.items() if way.count(",") == 1]  # No mixes.
-    return auto / max(others) if auto and others else None
-
-
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
+def _options() -> argparse.Namespace:
+    parser = options("sweeps", __doc__)
     parser.add_argument("overrides", nargs="*", help="of the runs, e.g. env=ant")
     parser.add_argument("--jobs", type=int, default=8, help="runs of a sweep")
     parser.add_argument("--at-once", type=int, nargs="*", default=[1, 2, 4, 8])
@@ -198,9 +169,8 @@ def _arguments() -> argparse.Namespace:
         action="store_true",
         help="with compiled programs from a short training before; otherwise each sweep compiles",
     )
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
     return parser.parse_intermixed_args()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

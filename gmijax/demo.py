@@ -79,7 +79,7 @@ def show_shipped(task: str, console: Console) -> None:
       ConfigError: there is none.
       GmijaxError: playing failed.
     """
-    config = shipped.checked(_play_config(task))
+    config = shipped.checked(play_config(task))
     paths = shipped.folder_of(config)
     shipped.play(paths, PLAY_S)
     returns = read_json(paths.returns)
@@ -96,7 +96,8 @@ def show_shipped(task: str, console: Console) -> None:
         console.print(f"other tasks: {', '.join(others)}")
 
 
-def _play_config(task: str) -> PlayConfig:
+def play_config(task: str) -> PlayConfig:
+    """As the demo plays the policy that is shipped for a task."""
     # Not by Hydra, which takes half a second.
     return PlayConfig(
         run=PlayRunConfig(dir=None, env=task),

@@ -109,7 +109,7 @@ def compare_products(
     def all_kinds(factors: list[tuple[jax.Array, jax.Array]]) -> list[jax.Array]:
         # One program for all kinds: they compile at the same time.
         pairs = zip(factors, PRECISIONS, strict=True)
-        return [_multiply(left, right, kind) for (left, right), kind in pairs]
+        return [multiply(left, right, kind) for (left, right), kind in pairs]
 
     compiled = jax.jit(all_kinds, compiler_options=dict(compiler_options or {}))
     draw = np.random.default_rng(0)
@@ -133,7 +133,7 @@ def _compare_with(options: Options) -> list[Product]:
         return list(compare_products())  # XLA's options come and go.
 
 
-def _multiply(left: jax.Array, right: jax.Array, kind: Precision) -> jax.Array:
+def multiply(left: jax.Array, right: jax.Array, kind: Precision) -> jax.Array:
     """[M, K] x [K, N] in one kind of arithmetic."""
     return jnp.matmul(left, right, precision=kind.algorithm)
 

@@ -83,7 +83,7 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
             patch.setattr(module, "detect_machine", lambda: machine)
         patch.setattr(doctor, "inspect_system", _would_start)
         # A page needs no folder.
-        patch.setattr(viewing, "_require_packages", _would_start)
+        patch.setattr(viewing, "require_packages", _would_start)
         for name in ("ray", "ray.util", "ray.util.scheduling_strategies"):
             patch.setitem(sys.modules, name, _Ray(name))
         patch.setattr(socket, "create_connection", _would_start)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from types import MappingProxyType
-
 from benchmarks.cases import SUITES, Case
-from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, markdown, rate, ratio, shown, source
+from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, rate, ratio, shown
 from benchmarks.evaluation.paper import CHANNELS
+from benchmarks.evaluation.writer import Rows, table
 
 LONG = "async-long"
+KEYS = ("pps", "ttop", WHOLE_RUN)
 
 ASYNC = (
     ("async-1gpu", "sync, 1 GMI x 8192", "sync, 1 GMI x 8192", ""),
@@ -31,13 +30,17 @@ ASYNC = (
 """File, case, what it is compared with, the paper's mean over two and four GPUs."""
 
 
-def asynchronous() -> list[str]:
+@table(
+    "async",
+    "ant | PPS: | TTOP: | steps/s of the whole run: | ratios: | the paper's: | return at the end:",
+    *("async-1gpu", "async-2gpu", "async-4gpu"),
+)
+def asynchronous() -> Rows:
     """Agents and trainers: medians of report lines, and whole runs."""
-    rows = []
     for file, case, base, paper in ASYNC:
         name = case if case.startswith(("1 +", "3 +")) else f"1 GPU, {case}"
-        cells = [shown(rate(file, case, key), ",.0f") for key in ("pps", "ttop", WHOLE_RUN)]
-        gains = [shown(ratio(file, case, base, key)) for key in ("pps", "ttop", WHOLE_RUN)]
+        cells = [shown(rate(file, case, key), ",.0f") for key in KEYS]
+        gains = [shown(ratio(file, case, base, key)) for key in KEYS]
         if case == base:
             gains, paper = ["1"] * 3, "1" if paper else ""
         if file == "async-1gpu":  # One process that does both has no PPS of its own.
@@ -45,27 +48,22 @@ def asynchronous() -> list[str]:
             cells[1] = shown(rate(file, case), ",.0f")
             cells[0] = "" if case == base else cells[0]
         final = shown(rate(file, case, "final_return"), ",.0f")
-        rows.append([name, *cells, " / ".join(filter(None, gains)), paper, final])
-    head = (
-        "ant | PPS: | TTOP: | steps/s of the whole run: | ratios: | the paper's: "
-        "| return at the end:"
-    )
-    return [*markdown(head, rows), *source("async-1gpu", "async-2gpu", "async-4gpu")]
+        yield [name, *cells, " / ".join(filter(None, gains)), paper, final]
 
 
-def asynchronous_long() -> list[str]:
+@table(
+    "async-long",
+    "ant, 100M steps | steps/s: | over synchronous: | steps/s of the whole run: "
+    "| over synchronous: | return at the end:",
+    LONG,
+)
+def asynchronous_long() -> Rows:
     """Runs of 100M steps, against synchronous training on as many GPUs."""
-    rows = []
     for case in SUITES[LONG]:
         keys = (TRAINING, WHOLE_RUN, "final_return")
         cells = [shown(rate(LONG, case.name, key), ",.0f") for key in keys]
         gains = [shown(over_synchronous(case, key)) for key in keys[:2]]
-        rows.append([case.name, cells[0], gains[0], cells[1], gains[1], cells[2]])
-    head = (
-        "ant, 100M steps | steps/s: | over synchronous: | steps/s of the whole run: "
-        "| over synchronous: | return at the end:"
-    )
-    return [*markdown(head, rows), *source(LONG)]
+        yield [case.name, cells[0], gains[0], cells[1], gains[1], cells[2]]
 
 
 def over_synchronous(case: Case, key: str = TRAINING) -> float | None:
@@ -80,21 +78,16 @@ def asynchronous_gains(gpus: int) -> list[float | None]:
     return [over_synchronous(case) for case in cases]
 
 
-def channels() -> list[str]:
+@table(
+    "channels",
+    "task | GPUs: | PPS: | TTOP: | whole run: | the paper's PPS / TTOP:",
+    "async-channels",
+)
+def channels() -> Rows:
     """Channels against tensor by tensor, in jobs."""
-    rows = []
-    keys = ("pps", "ttop", WHOLE_RUN)
     for task, gpus in (("ant", 2), ("humanoid", 2), *CHANNELS):
         names = f"{task} multi", f"{task} uni"
-        found = [ratio("async-channels", *names, key) if gpus == 2 else None for key in keys]
-        pairs = CHANNELS.get((task, gpus))
-        paper = " / ".join(f"{multi / uni:.2f}" for uni, multi in pairs) if pairs else ""
-        rows.append([f"`{task}`", str(gpus), *map(shown, found), paper])
-    head = "task | GPUs: | PPS: | TTOP: | whole run: | the paper's PPS / TTOP:"
-    return [*markdown(head, rows), *source("async-channels")]
-
-
-ASYNC_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
-    {"async": asynchronous, "async-long": asynchronous_long, "channels": channels}
-)
-"""By the name that documents use: `<!-- table: NAME -->`."""
+        found = [ratio("async-channels", *names, key) if gpus == 2 else None for key in KEYS]
+        pairs = CHANNELS.get((task, gpus), ())
+        paper = " / ".join(f"{multi / uni:.2f}" for uni, multi in pairs)
+        yield [f"`{task}`", str(gpus), *map(shown, found), paper]

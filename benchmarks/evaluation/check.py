@@ -143,5 +143,5 @@ def _figure(reference: str, form: str) -> str:
 
 def _table(name: str) -> str:
     if name not in TABLES:
-        raise ConfigError(f"table {name}: allowed are {', '.join(TABLES)}")
+        raise ConfigError(f"table {name}: allowed are {', '.join(sorted(TABLES))}")
     return "\n".join(TABLES[name]()) + "\n"

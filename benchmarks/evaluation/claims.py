@@ -9,7 +9,6 @@ from benchmarks.evaluation.figures import (
     NOT_MEASURED,
     WHOLE_RUN,
     bounds,
-    markdown,
     ratio,
     results_of,
     shown,
@@ -26,21 +25,22 @@ from benchmarks.evaluation.other_tables import (
 from benchmarks.evaluation.paper import LGR, lgr_gain
 from benchmarks.evaluation.tables import (
     LAYOUTS,
+    TEMPLATES,
     algorithm_1,
     best_plan_ratios,
     fixed_total_ratios,
     gain_of,
 )
+from benchmarks.evaluation.writer import Rows, table
 
 BACKEND_LINK = "[backends](evaluation/sharing.md#backends)"
 FIXED_LINK = "[fixed total](evaluation/one-gpu.md#one-training-run-in-several-gmis)"
-TEMPLATES = ("2 GMIs x 2048, tcg_ex", "2 + 1 GMIs x 2048, tdg_ex")
 
 
-def claims() -> list[str]:
-    """The table of all claims."""
-    head = "paper | what it says | the paper's | here | section"
-    return markdown(head, [*_model(), *_overall(), *_studies(), *_asynchronous()])
+@table("claims", "paper | what it says | the paper's | here | section")
+def claims() -> Rows:
+    """What the paper claims, and what was measured here."""
+    return [*_model(), *_overall(), *_studies(), *_asynchronous()]
 
 
 def _model() -> Iterator[list[str]]:

@@ -77,8 +77,12 @@ def summaries(file: str, case: str) -> list[Mapping[str, Any]]:
 
 def ratio(file: str, case: str, base: str, key: str = TRAINING) -> float | None:
     """Median of `case` over that of `base`: of one call, so of one machine."""
-    over, under = rate(file, case, key), rate(file, base, key)
-    return over.median / under.median if over and under else None
+    return over(rate(file, case, key), rate(file, base, key))
+
+
+def over(one: Figure | None, base: Figure | None) -> float | None:
+    """Median over median, where both were measured."""
+    return one.median / base.median if one and base else None
 
 
 def shown(value: Figure | float | None, form: str = ".2f") -> str:
@@ -97,52 +101,13 @@ def bounds(values: Sequence[float | None], form: str = ".2f") -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def markdown(head: str, rows: Sequence[Sequence[str]]) -> list[str]:
-    """A table; the columns of `head` are divided by `|`, those of numbers end with a colon."""
-    names = [name.strip() for name in head.split("|")]
-    rule = ["---:" if name.endswith(":") else "---" for name in names]
-    lines = [[name.removesuffix(":") for name in names], rule, *rows]
-    return [f"| {' | '.join(cells)} |" for cells in lines]
-
-
-def source(*files: str) -> list[str]:
-    """A line for each file: with what its call was made."""
-    return ["", *(_source_of(file) for file in files)]
-
-
-def _source_of(file: str) -> str:
-    call = call_of(file)
-    if call is None:
-        return f"- `{file}.json`: {NOT_MEASURED}"
-    return f"- {link(f'{file}.json')}: {origin(call)}"
-
-
-def link(file_name: str) -> str:
-    """A file of results, as a page in `docs/evaluation/` points at it."""
-    return f"[`{file_name}`](../../benchmarks/results/{file_name})"
-
-
-def origin(call: Call) -> str:
-    """Commit, date, device, driver and repeats of a call; `unknown` where the file is silent."""
-    commits = [one[:10] for one in (call.commit or "unknown").split(", ")]
-    parts = [f"commit {', '.join(commits)}" + (" with changes" if call.is_dirty else "")]
-    parts.append(call.date[:10] if call.date else "date unknown")
-    parts.append(call.device or "device unknown")
-    parts += [f"driver {call.driver}"] if call.driver else []
-    if repeats := sorted(set(_repeats(call.results))):
-        least, most = repeats[0], repeats[-1]
-        shown = str(least) if least == most else f"{least} to {most}"
-        parts.append(f"{shown} {'run' if most == 1 else 'runs'} of each case")
-    return ", ".join(parts)
-
-
 def _count(results: Mapping[str, Any]) -> int:
     """How much was measured: cases with runs, or rows of whatever the suite has."""
     lists = [results.get(key, ()) for key in ("cases", "rows", "points", "runs", "tasks")]
-    return len(list(_repeats(results))) or max(map(len, lists))
+    return len(list(repeats_of(results))) or max(map(len, lists))
 
 
-def _repeats(results: Mapping[str, Any]) -> Iterator[int]:
+def repeats_of(results: Mapping[str, Any]) -> Iterator[int]:
     """How often each case was measured, of those that were."""
     cases = results.get("cases", ())
     for case in cases.values() if isinstance(cases, Mapping) else cases:

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from benchmarks.evaluation.figures import NOT_MEASURED, Figure, bounds, markdown
-from benchmarks.evaluation.other_tables import seconds_to_mark, seconds_to_recover
+from benchmarks.evaluation.figures import NOT_MEASURED, Figure, bounds
+from benchmarks.evaluation.learning_tables import seconds_to_mark
+from benchmarks.evaluation.other_tables import seconds_to_recover
 from benchmarks.evaluation.pack_tables import packed
 from benchmarks.evaluation.peer_tables import over_brax
 from benchmarks.evaluation.sweep_tables import first_gains
+from benchmarks.evaluation.writer import Rows, table
 
 EVALUATION = "docs/evaluation"
 _SECONDS, _TIMES = "s of training", "times the steps/s"
 
 
-def front() -> list[str]:
+@table("front", "what | measured | on")
+def front() -> Rows:
     """What was measured, on which GPU, and where its file is."""
     eight = first_gains("steady_steps_per_s").get("8 at once, auto")
     recovered = seconds_to_recover().get("kill")
     beside = [value for value in over_brax() if value is not None]
     marks, sharing = "learning.md#seconds-to-published-returns", "sharing.md"
     ant, humanoid = (seconds_to_mark(task) for task in ("ant", "humanoid"))
-    rows = [
+    return [
         _row("`ant` learns to run (return 3,000)", *_of(ant, ".1f", _SECONDS), "H100", marks),
         _row(
             "`humanoid` learns to run (return 5,000)",
@@ -51,7 +54,6 @@ def front() -> list[str]:
             *("H200", "speed.md#recovery-from-faults"),
         ),
     ]
-    return markdown("what | measured | on", rows)
 
 
 def _row(what: str, measured: str, runs: str, gpu: str, section: str) -> list[str]:

@@ -5,16 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from benchmarks.evaluation.figures import (
-    NOT_MEASURED,
-    Figure,
-    figure,
-    link,
-    markdown,
-    origin,
-    shown,
-)
+from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
+from benchmarks.evaluation.writer import lines, link, markdown, origin
 from benchmarks.records import RESULTS, Call, calls_by_date
+from benchmarks.steady import are_alike
 
 _HEAD = (
     "training | at once | steps/s while all report: | over one: | trainings per hour: | over one:"
@@ -33,6 +27,11 @@ class _Training(NamedTuple):
     file: str
     ways: Mapping[str, Sequence[Mapping[str, Any]]]
 
+    @property
+    def is_mix(self) -> bool:
+        """Whether its jobs are of several kinds, whose steps do not add up."""
+        return not all(are_alike(row["jobs"]) for rows in self.ways.values() for row in rows)
+
     def rate(self, way: str, key: str) -> Figure | None:
         """A rate over the repeats of a way."""
         return figure([row[key] for row in self.ways.get(way, ()) if row.get(key) is not None])
@@ -40,10 +39,10 @@ class _Training(NamedTuple):
     def over_one(self, way: str, key: str) -> float | None:
         """A rate over that of one at a time."""
         alone = next((one for one in self.ways if one.startswith("1 ")), "")
-        rate, base = self.rate(way, key), self.rate(alone, key)
-        return rate.median / base.median if rate and base else None
+        return over(self.rate(way, key), self.rate(alone, key))
 
 
+@lines("packs")
 def packs() -> list[str]:
     """Steps per second and trainings per hour of every training, by number at once.
 
@@ -52,8 +51,8 @@ def packs() -> list[str]:
     found = _trainings()
     rows = [cells for name, training in found.items() for cells in _rows(name, training)]
     calls = {(one.file, one.call.date): one.call for one in found.values()}
-    lines = [f"- {link(file)}: {origin(call)}" for (file, _), call in calls.items()]
-    return [*markdown(_HEAD, rows), "", *(lines or [f"- `packs-*.json`: {NOT_MEASURED}"])]
+    files = [f"- {link(file)}: {origin(call)}" for (file, _), call in calls.items()]
+    return [*markdown(_HEAD, rows), "", *(files or [f"- `packs-*.json`: {NOT_MEASURED}"])]
 
 
 class Packed(NamedTuple):
@@ -115,6 +114,7 @@ def _rows(name: str, training: _Training) -> list[list[str]]:
     for way in training.ways:
         cells = [name if not rows else "", way]
         for key, form in ((_STEPS, ",.0f"), (_FINISHED, ",.1f")):
-            cells += [shown(training.rate(way, key), form), shown(training.over_one(way, key))]
+            gained = shown(training.rate(way, key), form), shown(training.over_one(way, key))
+            cells += ("", "") if training.is_mix and key == _STEPS else gained
         rows.append(cells)
     return rows

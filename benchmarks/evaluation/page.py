@@ -1,29 +1,29 @@
-"""Every table that documents can have, by name, and the advice that they add up to."""
+"""The advice that the measurements add up to, and every other table, so that all have names."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from types import MappingProxyType
-
-from benchmarks.evaluation.async_tables import ASYNC_TABLES, asynchronous_gains
-from benchmarks.evaluation.claims import claims
-from benchmarks.evaluation.figures import bounds, markdown, shown
-from benchmarks.evaluation.front import front
-from benchmarks.evaluation.other_tables import OTHER_TABLES
-from benchmarks.evaluation.pack_tables import packed_gains, packs
-from benchmarks.evaluation.peer_tables import peers
-from benchmarks.evaluation.plots import mps_gains
-from benchmarks.evaluation.seed_tables import brax_returns, playground, playground_seeds, seeds
-from benchmarks.evaluation.sweep_tables import first_gains, program_over_processes, sweeps
-from benchmarks.evaluation.tables import (
-    TRAINING_TABLES,
-    best_plan_ratios,
-    fixed_total_ratios,
-    over_one_gpu,
+from benchmarks.evaluation import (  # noqa: F401  Each registers its tables.
+    claims,
+    front,
+    learning_tables,
+    seed_tables,
 )
+from benchmarks.evaluation.async_tables import asynchronous_gains
+from benchmarks.evaluation.figures import bounds, shown
+from benchmarks.evaluation.pack_tables import packed_gains
+from benchmarks.evaluation.plots import mps_gains
+from benchmarks.evaluation.sweep_tables import first_gains, program_over_processes
+from benchmarks.evaluation.tables import best_plan_ratios, fixed_total_ratios, over_one_gpu
+from benchmarks.evaluation.writer import TABLES, Rows, table
+
+__all__ = ["TABLES", "advice"]
 
 
-def advice() -> list[str]:
+@table(
+    "advice",
+    "you have | several GMIs per GPU? | measured (on H200s with ant, unless said)",
+)
+def advice() -> Rows:
     """Who gains from GMIs, and who does not."""
     eightfold = first_gains().get("8 at once, auto")
     throughput = first_gains("steady_steps_per_s").get("8 at once, auto")
@@ -32,7 +32,7 @@ def advice() -> list[str]:
     ]
     fixed = bounds([*fixed_total_ratios().values()])
     peak = bounds([*best_plan_ratios().values()])
-    rows = [
+    return [
         [
             *("many small runs on one GPU (seeds, a sweep)", "**yes**: `gmijax sweep`"),
             f"eight runs at once: {shown(throughput)} times the steps/s of one; with start-up, "
@@ -67,25 +67,3 @@ def advice() -> list[str]:
             f"GPU, {bounds(asynchronous_gains(2))} on two (H100s, 100M steps)",
         ],
     ]
-    head = "you have | several GMIs per GPU? | measured (on H200s with ant, unless said)"
-    return markdown(head, rows)
-
-
-TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
-    {
-        "advice": advice,
-        "front": front,
-        "claims": claims,
-        "packs": packs,
-        "peers": peers,
-        "sweeps": sweeps,
-        "seeds": seeds,
-        "playground": playground,
-        "playground-seeds": playground_seeds,
-        "brax-returns": brax_returns,
-        **TRAINING_TABLES,
-        **ASYNC_TABLES,
-        **OTHER_TABLES,
-    }
-)
-"""By the name that documents use: `<!-- table: NAME -->`."""

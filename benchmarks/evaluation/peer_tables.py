@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.evaluation.figures import NOT_MEASURED, link, markdown, origin
+from benchmarks.evaluation.figures import NOT_MEASURED
+from benchmarks.evaluation.writer import lines, link, markdown, origin
 from benchmarks.peers.comparisons import BRAX, COMPARISONS
 from benchmarks.peers.table import HEAD, measured, ratio, row
 from benchmarks.records import RESULTS, Call, calls_by_date
@@ -12,6 +13,7 @@ from benchmarks.records import RESULTS, Call, calls_by_date
 PATTERN = "peers-nvidia-*.json"
 
 
+@lines("peers")
 def peers() -> list[str]:
     """Every comparison from the newest call that measured both of its sides."""
     calls = calls_by_date(RESULTS, PATTERN)
@@ -24,8 +26,8 @@ def peers() -> list[str]:
         rows.append(row(call.results if call else {}, name))
         if call and path:
             origins.setdefault((link(path.name), origin(call)), []).append(name)
-    lines = [f"- {file}, {'; '.join(names)}: {made}" for (file, made), names in origins.items()]
-    return [*markdown(HEAD, rows), "", *lines]
+    files = [f"- {file}, {'; '.join(names)}: {made}" for (file, made), names in origins.items()]
+    return [*markdown(HEAD, rows), "", *files]
 
 
 def over_brax() -> list[float | None]:

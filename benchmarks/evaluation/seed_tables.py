@@ -8,16 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.cases import SUITES
-from benchmarks.evaluation.figures import (
-    figure,
-    link,
-    markdown,
-    origin,
-    rate,
-    shown,
-    source,
-    summaries,
-)
+from benchmarks.evaluation.figures import figure, rate, shown, summaries
+from benchmarks.evaluation.writer import Rows, lines, link, markdown, origin, table
 from benchmarks.records import RESULTS, Call, calls_by_date
 
 PATTERN = "seeds-*-nvidia-*.json"
@@ -28,6 +20,7 @@ HEAD = (
 )
 
 
+@lines("seeds")
 def seeds() -> list[str]:
     """Successes of every setting whose seeds all ran, by task and call; calls in order of date."""
     rows, calls, number = [], [], Counter[str]()
@@ -43,6 +36,7 @@ def seeds() -> list[str]:
     return [*markdown(HEAD, rows), "", *calls]
 
 
+@lines("playground-seeds")
 def playground_seeds() -> list[str]:
     """What tasks of Playground reach with Playground's settings, over seeds, as they train.
 
@@ -70,6 +64,7 @@ def _returns(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     return [", ".join(shown(one, ".0f") for one in ends) for ends in (of_training, evaluated)]
 
 
+@lines("brax-returns")
 def brax_returns() -> list[str]:
     """What Brax's PPO reaches on tasks of Playground, in every run of a task's newest call."""
     newest = {
@@ -125,15 +120,17 @@ def _changed(row: Mapping[str, Any]) -> str:
     return ", ".join(f"`{override}`" for override in row["overrides"]) or "nothing"
 
 
-def playground() -> list[str]:
+@table(
+    "playground",
+    "task | million steps: | steps/s: | seconds of training: | return at the end:",
+    "playground",
+)
+def playground() -> Rows:
     """What tasks of Playground reach with its own settings, in evaluations without noise."""
-    rows, suite = [], "playground"
-    for case in SUITES[suite]:
-        found = summaries(suite, case.name)
+    for case in SUITES["playground"]:
+        found = summaries("playground", case.name)
         steps = shown(figure([one["env_steps"] / 1e6 for one in found]), ",.0f")
-        seconds = shown(rate(suite, case.name, "train_wall_s"), ",.0f")
+        seconds = shown(rate("playground", case.name, "train_wall_s"), ",.0f")
         last = figure([one["eval"]["last"]["return"] for one in found])
-        cells = [shown(rate(suite, case.name), ",.0f"), seconds, shown(last, ",.4g")]
-        rows.append([case.name, steps, *cells])
-    head = "task | million steps: | steps/s: | seconds of training: | return at the end:"
-    return [*markdown(head, rows), *source(suite)]
+        rates = shown(rate("playground", case.name), ",.0f")
+        yield [case.name, steps, rates, seconds, shown(last, ",.4g")]

@@ -5,15 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
-from benchmarks.evaluation.figures import (
-    NOT_MEASURED,
-    Figure,
-    figure,
-    link,
-    markdown,
-    origin,
-    shown,
-)
+from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
+from benchmarks.evaluation.writer import lines, link, markdown, origin
 from benchmarks.records import RESULTS, Call, calls_by_date
 
 PATTERN = "sweeps-nvidia-*.json"
@@ -88,13 +81,13 @@ def first_gains(key: str = "trainings_per_hour") -> dict[str, Figure]:
 def program_over_processes(key: str) -> float | None:
     """Eight jobs as one program, over the same jobs in eight processes."""
     rates = next((same.rates(key) for same in same_jobs().values()), {})
-    program, processes = rates.get("8 at once, vmap"), rates.get("8 at once, auto")
-    return program.median / processes.median if program and processes else None
+    return over(rates.get("8 at once, vmap"), rates.get("8 at once, auto"))
 
 
+@lines("sweeps")
 def sweeps() -> list[str]:
     """Training runs per hour, where they were measured."""
-    lines: list[str] = []
+    found: list[str] = []
     for what, same in same_jobs().items():
         gains, sharing = same.gains(), same.gains_over_sharing()
         steps = same.rates("steady_steps_per_s")
@@ -109,8 +102,8 @@ def sweeps() -> list[str]:
             ]
             for way, rate in sorted(same.rates().items(), key=lambda row: _order(row[0]))
         ]
-        lines += [what, "", *markdown(HEAD, rows), "", *same.calls, ""]
-    return lines[:-1] or [
+        found += [what, "", *markdown(HEAD, rows), "", *same.calls, ""]
+    return found[:-1] or [
         f"Training runs per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."
     ]
 

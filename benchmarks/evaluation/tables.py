@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from types import MappingProxyType
+from collections.abc import Iterator
 from typing import NamedTuple
 
 from benchmarks.cases import PLANS, TASKS
@@ -11,15 +10,15 @@ from benchmarks.evaluation.figures import (
     Figure,
     call_of,
     figure,
-    markdown,
+    over,
     rate,
     ratio,
     results_of,
     shown,
-    source,
     summaries,
 )
 from benchmarks.evaluation.paper import LGR, lgr_gain
+from benchmarks.evaluation.writer import Rows, table
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import select_strategy
 
@@ -55,6 +54,9 @@ OTHERS = (
 IN_GPU_MEMORY = ("one_shot", "auto")
 """Exchanges that do not pass the host: `auto` where a file does not say what it became."""
 
+SMALL = "search-ant-one_shot-h200"
+TEMPLATES = ("2 GMIs x 2048, tcg_ex", "2 + 1 GMIs x 2048, tdg_ex")
+
 
 def pair(file: str, case: str, base: str) -> tuple[Figure | None, Figure | None]:
     """Steps/s of two cases, of one call."""
@@ -79,27 +81,24 @@ def exchange_of(file: str, case: str) -> str:
 
 def fixed_total_ratios() -> dict[str, float | None]:
     """Several GMIs on one GPU over one process with as many environments, as jobs exchange now."""
-    ratios = {}
-    for what, file, case, base in ONE_GPU:
-        if exchange_of(file, case) in IN_GPU_MEMORY:
-            several, alone = pair(file, case, base)
-            ratios[f"{what} ({file})"] = (
-                several.median / alone.median if several and alone else None
-            )
-    return ratios
+    return {
+        f"{what} ({file})": over(*pair(file, case, base))
+        for what, file, case, base in ONE_GPU
+        if exchange_of(file, case) in IN_GPU_MEMORY
+    }
 
 
-def fixed_total() -> list[str]:
+@table(
+    "fixed-total",
+    "on each GPU | exchange | GMIs, steps/s: | one process, steps/s: | ratio: | file",
+    *dict.fromkeys(file for _, file, *_ in (*ONE_GPU, *OTHERS)),
+)
+def fixed_total() -> Rows:
     """The same environments in one process on each GPU, and in several."""
-    rows = []
     for what, file, case, base in (*ONE_GPU, *OTHERS):
-        several, alone = pair(file, case, base)
-        gain = several.median / alone.median if several and alone else None
-        rates = (shown(value, ",.0f") for value in (several, alone))
-        rows.append([what, f"`{exchange_of(file, case)}`", *rates, shown(gain), f"`{file}`"])
-    head = "on each GPU | exchange | GMIs, steps/s: | one process, steps/s: | ratio: | file"
-    files = dict.fromkeys(file for _, file, *_ in (*ONE_GPU, *OTHERS))
-    return [*markdown(head, rows), *source(*files)]
+        found = pair(file, case, base)
+        rates = (shown(value, ",.0f") for value in found)
+        yield [what, f"`{exchange_of(file, case)}`", *rates, shown(over(*found)), f"`{file}`"]
 
 
 def fastest(task: str, *, several: bool) -> tuple[Figure, str] | None:
@@ -117,47 +116,53 @@ def best_plan_ratios() -> dict[str, float | None]:
     ratios = {}
     for task in TASKS:
         one, several = fastest(task, several=False), fastest(task, several=True)
-        ratios[task] = several[0].median / one[0].median if one and several else None
+        ratios[task] = over(several[0], one[0]) if one and several else None
     return ratios
 
 
-def best_plans() -> list[str]:
+@table(
+    "best-plans",
+    "task | one process x environments, steps/s: | several GMIs, steps/s: | ratio:",
+    "plans",
+)
+def best_plans() -> Rows:
     """Each side at its own peak."""
-    rows = []
     for task, gain in best_plan_ratios().items():
         best = [fastest(task, several=several) for several in (False, True)]
         cells = [f"{made[1]}: {made[0].shown()}" if made else shown(None) for made in best]
-        rows.append([f"`{task}`", *cells, shown(gain)])
-    head = "task | one process x environments, steps/s: | several GMIs, steps/s: | ratio:"
-    return [*markdown(head, rows), *source("plans")]
+        yield [f"`{task}`", *cells, shown(gain)]
 
 
-def training_backends() -> list[str]:
+@table(
+    "training-backends",
+    "ant, MJX-JAX | exchange | `mps`, steps/s: | `share`, steps/s: | ratio:",
+    *("ant-1gpu", "ant-2gpu"),
+)
+def training_backends() -> Rows:
     """MPS against plain sharing, in training."""
-    rows = []
     for file, what in (("ant-1gpu", "4 GMIs x 2048"), ("ant-2gpu", "2 GPUs x 2 GMIs x 2048")):
         names = [f"{what}, {backend}" for backend in ("mps", "share")]
         rates = (shown(rate(file, name), ",.0f") for name in names)
         exchange = f"`{exchange_of(file, names[0])}`"
-        rows.append([what, exchange, *rates, shown(ratio(file, names[0], names[1]))])
-    head = "ant, MJX-JAX | exchange | `mps`, steps/s: | `share`, steps/s: | ratio:"
-    return [*markdown(head, rows), *source("ant-1gpu", "ant-2gpu")]
+        yield [what, exchange, *rates, shown(ratio(file, names[0], names[1]))]
 
 
-def weak_scaling() -> list[str]:
+@table(
+    "weak-scaling",
+    "GPUs x GMIs x environments | exchange | steps/s: | over one GPU: | of ideal:",
+    *("scaling", "scaling-one_shot"),
+)
+def weak_scaling() -> Rows:
     """8192 environments on every GPU."""
-    rows = []
     for file, gmis, way in (
         *(("scaling", 1, "`flat`"), ("scaling-one_shot", 2, "`one_shot`")),
         ("scaling", 2, "`har`"),
     ):
-        names = [f"{gpus} GPUs x {gmis} GMIs x {8192 // gmis}" for gpus in (1, 2, 4, 8)]
-        for gpus, name in zip((1, 2, 4, 8), names, strict=True):
-            gain = ratio(file, name, names[0])
+        for gpus in (1, 2, 4, 8):
+            name, alone = (f"{n} GPUs x {gmis} GMIs x {8192 // gmis}" for n in (gpus, 1))
+            gain = ratio(file, name, alone)
             cells = [shown(rate(file, name), ",.0f"), shown(gain), shown(gain and gain / gpus)]
-            rows.append([f"{gpus} x {gmis} x {8192 // gmis:,}", way, *cells])
-    head = "GPUs x GMIs x environments | exchange | steps/s: | over one GPU: | of ideal:"
-    return [*markdown(head, rows), *source("scaling", "scaling-one_shot")]
+            yield [f"{gpus} x {gmis} x {8192 // gmis:,}", way, *cells]
 
 
 def over_one_gpu(gpus: int) -> float | None:
@@ -165,15 +170,17 @@ def over_one_gpu(gpus: int) -> float | None:
     return ratio("scaling", f"{gpus} GPUs x 1 GMIs x 8192", "1 GPUs x 1 GMIs x 8192")
 
 
-def templates() -> list[str]:
+@table(
+    "templates",
+    "task | `tcg_ex`, steps/s: | `tdg_ex`, steps/s: | ratio: | the paper's:",
+    *("templates-ant", "templates-humanoid"),
+)
+def templates() -> Rows:
     """Trainers among their simulators against trainers apart."""
-    rows = []
     for task in ("ant", "humanoid"):
-        both = ("2 GMIs x 2048, tcg_ex", "2 + 1 GMIs x 2048, tdg_ex")
-        rates = [shown(rate(f"templates-{task}", name), ",.0f") for name in both]
-        rows.append([f"`{task}`", *rates, shown(ratio(f"templates-{task}", *both)), "5"])
-    head = "task | `tcg_ex`, steps/s: | `tdg_ex`, steps/s: | ratio: | the paper's:"
-    return [*markdown(head, rows), *source("templates-ant", "templates-humanoid")]
+        file = f"templates-{task}"
+        rates = [shown(rate(file, name), ",.0f") for name in TEMPLATES]
+        yield [f"`{task}`", *rates, shown(ratio(file, *TEMPLATES)), "5"]
 
 
 class Gain(NamedTuple):
@@ -202,14 +209,23 @@ def gain_of(task: str, at: str, way: str) -> Gain:
     alone = f"lgr-{task}-{way}"
     mpr = rate(file, f"{at} mpr")
     own = rate(file, f"{at} {way}") or rate(alone, f"{at} {way}")
-    return Gain(mpr, own, own.median / mpr.median if own and mpr else None)
+    return Gain(mpr, own, over(own, mpr))
 
 
-def lgr() -> list[str]:
-    """Every reduction that was measured in training against `mpr`."""
-    rows, files = [], []
+def _lgr_files() -> Iterator[str]:
     for task in LGR:
-        files += [f"lgr-{task}-one_shot", f"lgr-{task}", f"lgr-{task}-mrr"]
+        yield from filter(call_of, (f"lgr-{task}{way}" for way in ("-one_shot", "", "-mrr")))
+
+
+@table(
+    "lgr",
+    "task | GMIs | exchange | by Algorithm 1 | `mpr`, steps/s: | steps/s: | ratio: | "
+    "the paper's LGR:",
+    more=_lgr_files,
+)
+def lgr() -> Rows:
+    """Every reduction that was measured in training against `mpr`."""
+    for task in LGR:
         for way in ("one_shot", "mrr", "har"):
             for at in LAYOUTS:
                 chosen, gain = way == algorithm_1(at), gain_of(task, at, way)
@@ -218,35 +234,23 @@ def lgr() -> list[str]:
                 paper = f"{lgr_gain(task, at):.2f}" if chosen else "-"
                 cells = [shown(gain.mpr, ",.0f"), shown(gain.own, ",.0f"), shown(gain.ratio)]
                 names = [f"`{task}`", LAYOUTS[at], f"`{way}`", "yes" if chosen else "no"]
-                rows.append([*names, *cells, paper])
-    head = (
-        "task | GMIs | exchange | by Algorithm 1 | `mpr`, steps/s: | steps/s: | ratio: | "
-        "the paper's LGR:"
-    )
-    return [*markdown(head, rows), *source(*filter(call_of, files))]
+                yield [*names, *cells, paper]
 
 
-def num_env() -> list[str]:
+@table(
+    "num-env",
+    "task | environments: | MJX | steps/s: | memory, MiB:",
+    *("tasks-jax", "tasks-warp"),
+)
+def num_env() -> Rows:
     """Throughput and memory over environments, one GMI."""
-    rows = []
     for task in ("ant", "humanoid"):
         for impl in ("jax", "warp"):
             for envs in (512, 2048, 8192, 32768):
                 name, file = f"{task} {impl} {envs}", f"tasks-{impl}"
-                cells = [shown(rate(file, name), ",.0f"), _memory(file, name)]
-                rows.append([f"`{task}`", f"{envs:,}", impl, *cells])
-    return [
-        *markdown("task | environments: | MJX | steps/s: | memory, MiB:", rows),
-        *source("tasks-jax", "tasks-warp"),
-    ]
-
-
-def _memory(file: str, name: str) -> str:
-    found = [summary["device"]["peak_memory_mib"] for summary in summaries(file, name)]
-    return shown(figure(found), ",.0f")
-
-
-SMALL = "search-ant-one_shot-h200"
+                memory = [one["device"]["peak_memory_mib"] for one in summaries(file, name)]
+                cells = [shown(one, ",.0f") for one in (rate(file, name), figure(memory))]
+                yield [f"`{task}`", f"{envs:,}", impl, *cells]
 
 
 def small_gmis() -> dict[int, float]:
@@ -258,27 +262,17 @@ def small_gmis() -> dict[int, float]:
     }
 
 
-def many_small() -> list[str]:
+@table(
+    "many-small",
+    "GMIs x environments each, ant, MJX-Warp | steps/s of the GPU: | over one:",
+    SMALL,
+)
+def many_small() -> Rows:
     """What a GPU makes of several small processes."""
     rates = small_gmis()
-    rows = [
-        [f"{gmis} x 2,048", f"{value:,.0f}", shown(value / rates[1] if 1 in rates else None)]
-        for gmis, value in sorted(rates.items())
-    ]
-    head = "GMIs x environments each, ant, MJX-Warp | steps/s of the GPU: | over one:"
-    return [*markdown(head, rows), *source(SMALL)]
-
-
-TRAINING_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
-    {
-        "fixed-total": fixed_total,
-        "best-plans": best_plans,
-        "training-backends": training_backends,
-        "weak-scaling": weak_scaling,
-        "templates": templates,
-        "lgr": lgr,
-        "num-env": num_env,
-        "many-small": many_small,
-    }
-)
-"""By the name that documents use: `<!-- table: NAME -->`."""
+    for gmis, value in sorted(rates.items()):
+        yield [
+            f"{gmis} x 2,048",
+            f"{value:,.0f}",
+            shown(value / rates[1] if 1 in rates else None),
+        ]

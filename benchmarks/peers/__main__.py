@@ -12,10 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
-import re
-import signal
 import sys
 import tempfile
 import time
@@ -24,12 +21,21 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from benchmarks.command import STOP_S, start, wait_until
-from benchmarks.evaluation.figures import markdown
+from benchmarks.evaluation.writer import markdown
 from benchmarks.peers.comparisons import COMPARISONS, MJLAB, missing_package
 from benchmarks.peers.side import Side
 from benchmarks.peers.table import HEAD, OURS, row
-from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
+from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.runner import (
+    STOP_S,
+    as_word,
+    deadline,
+    exit_code,
+    in_turn,
+    options,
+    start,
+    wait_until,
+)
 from benchmarks.steady import settled_rate
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
@@ -41,20 +47,16 @@ CURVE_POINTS = 60
 class Benchmark:
     """The runs of one call, in its file after each of them."""
 
-    def __init__(
-        self, arguments: argparse.Namespace, scratch: Path, sides: Sequence[Side]
-    ) -> None:
-        self._arguments, self._scratch = arguments, scratch
-        self._has_gpu = bool(detect_machine().gpus)
-        self._deadline_s = time.monotonic() + (arguments.deadline_s or math.inf)
-        self._took_s: dict[Side, float] = {}
-        self._sides = list(sides)
-        path = arguments.out / file_name("peers", device_name())
-        self.file = ResultsFile(path, "peers", vars(arguments))
-        cases = self.file.results.setdefault("cases", {})
+    def __init__(self, given: argparse.Namespace, scratch: Path, sides: Sequence[Side]) -> None:
+        self._given, self._scratch, self._sides = given, scratch, list(sides)
+        self._deadline_s = deadline(given.deadline_s)
+        self.file = ResultsFile(
+            given.out / file_name("peers", device_name()), "peers", vars(given)
+        )
         self._runs: dict[Side, list[dict[str, Any]]] = {side: [] for side in sides}
-        for side in sides:
-            cases[str(side)] = {"told": side.told, "runs": self._runs[side]}
+        self.file.results["cases"] = {
+            str(side): {"told": side.told, "runs": runs} for side, runs in self._runs.items()
+        }
 
     @property
     def has_failed(self) -> bool:
@@ -66,41 +68,58 @@ class Benchmark:
         at_once = max(1, (os.cpu_count() or 1) // 2)
         for first in range(0, len(self._sides), at_once):
             self._compile(self._sides[first : first + at_once])
-        for repeat in range(self._arguments.repeats):
-            for side in self._sides:
-                if self._has_time(side):
-                    self._add(side, self._run(side, repeat))
+        for repeat, side in in_turn(self._sides, self._given.repeats, self._deadline_s):
+            self._add(side, self._run(side, repeat))
 
     def _compile(self, sides: Sequence[Side]) -> None:
         """Short runs at the same time; a side that fails is not tried again."""
         folders = [self._new_folder(side, "compile") for side in sides]
-        with ExitStack() as logs:
-            processes = []
-            for side, folder in zip(sides, folders, strict=True):
-                log = logs.enter_context((folder / "log").open("wb"))
-                command = side.short_command(folder, has_gpu=self._has_gpu)
-                processes.append(start(command, self._variables(side, is_short=True), log))
-            codes = wait_until(self._training_deadline_s(), *processes)
-        for side, folder, code in zip(sides, folders, codes, strict=True):
-            if code:
-                self._add(side, {"repeat": 0, "failed": self._reason(folder, code)})
+        commands = [
+            side.short_command(folder, has_gpu=bool(detect_machine().gpus))
+            for side, folder in zip(sides, folders, strict=True)
+        ]
+        failures = self._train(sides, folders, commands, is_short=True)
+        for side, failure in zip(sides, failures, strict=True):
+            if failure:
+                self._add(side, {"repeat": 0, "failed": failure})
                 self._sides.remove(side)
 
     def _run(self, side: Side, repeat: int) -> dict[str, Any]:
         """One training as a whole command."""
         folder, started_s = self._new_folder(side, str(repeat)), time.monotonic()
-        with (folder / "log").open("wb") as log:
-            command = side.command(folder, seed=repeat)
-            process = start(command, self._variables(side, is_short=False), log)
-            code = wait_until(self._training_deadline_s(), process)[0]
-        self._took_s[side] = command_s = time.monotonic() - started_s
-        curve = side.curve(folder) if code == 0 else []
+        command = side.command(folder, seed=repeat)
+        (failure,) = self._train([side], [folder], [command], is_short=False)
+        command_s = time.monotonic() - started_s
+        curve = [] if failure else side.curve(folder)
         rate = settled_rate(curve) if curve else None
         if rate is None:
-            return {"repeat": repeat, "failed": self._reason(folder, code)}
+            return {"repeat": repeat, "failed": failure or self._reason(folder, 0)}
         summary = {"steps_per_s": rate, "command_s": command_s, "env_steps": curve[-1][1]}
         kept = curve[:: max(1, len(curve) // CURVE_POINTS)]
         return {"repeat": repeat, "summary": summary, "curve": kept}
+
+    def _train(
+        self,
+        sides: Sequence[Side],
+        folders: Sequence[Path],
+        commands: Sequence[Sequence[str]],
+        *,
+        is_short: bool,
+    ) -> list[str | None]:
+        """Runs commands at the same time; why each failed, None of those that did not."""
+        with ExitStack() as logs:
+            processes = [
+                start(
+                    command,
+                    side.variables(self._scratch / "xla", is_short=is_short),
+                    logs.enter_context((folder / "log").open("wb")),
+                )
+                for side, folder, command in zip(sides, folders, commands, strict=True)
+            ]
+            timeout_s = min(self._deadline_s, deadline(self._given.timeout_s + STOP_S))
+            codes = wait_until(timeout_s, *processes)
+        found = zip(folders, codes, strict=True)
+        return [self._reason(folder, code) if code else None for folder, code in found]
 
     def _add(self, side: Side, run: dict[str, Any]) -> None:
         with self.file.changing():
@@ -109,49 +128,31 @@ class Benchmark:
         sys.stdout.write(f"{side}: {json.dumps(shown)}\n")
         sys.stdout.flush()
 
-    def _variables(self, side: Side, *, is_short: bool) -> dict[str, str]:
-        return side.variables(self._scratch / "xla", is_short=is_short)
-
     def _reason(self, folder: Path, code: int) -> str:
         if time.monotonic() > self._deadline_s - STOP_S:
             return "ended by the deadline"
         return last_line(folder / "log") or f"exit code {code}"
 
     def _new_folder(self, side: Side, what: str) -> Path:
-        name = re.sub(r"[^a-zA-Z0-9]+", "-", f"{side} {what}")  # A value on a command line.
         self._scratch.mkdir(parents=True, exist_ok=True)
-        return Path(tempfile.mkdtemp(prefix=f"{name}-", dir=self._scratch))
-
-    def _training_deadline_s(self) -> float:
-        return min(self._deadline_s, time.monotonic() + self._arguments.timeout_s + STOP_S)
-
-    def _has_time(self, side: Side) -> bool:
-        return time.monotonic() + self._took_s.get(side, 0.0) < self._deadline_s - STOP_S
+        return Path(tempfile.mkdtemp(prefix=as_word(f"{side} {what} "), dir=self._scratch))
 
 
 def main() -> int:
-    """Measures what the command line asks for; returns 1 if a run failed, 2 on bad input."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    arguments = _arguments()
-    try:
-        more = tuple(arguments.overrides)
-        sides = list(wanted_sides(arguments.only or [], more, arguments.mjlab))
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+    """Measures what the command line asks for; returns 1 if a run failed, else 0."""
+    given = _options()
+    sides = list(wanted_sides(given.only or [], tuple(given.overrides), given.mjlab))
     if not sides:
         return 1
-    code = 0
     with tempfile.TemporaryDirectory() as scratch:
-        benchmark = Benchmark(arguments, (arguments.runs or Path(scratch)).absolute(), sides)
+        benchmark = Benchmark(given, (given.runs or Path(scratch)).absolute(), sides)
         try:
             benchmark.run()
-        except KeyboardInterrupt:
-            code = 130
-    results = benchmark.file.results
-    rows = [row(results, name) for name in dict.fromkeys(side.comparison for side in sides)]
-    sys.stdout.writelines(f"{line}\n" for line in markdown(HEAD, rows))
-    return code or int(benchmark.has_failed)
+        finally:
+            names = dict.fromkeys(side.comparison for side in sides)
+            rows = [row(benchmark.file.results, name) for name in names]
+            sys.stdout.writelines(f"{line}\n" for line in markdown(HEAD, rows))
+    return int(benchmark.has_failed)
 
 
 def wanted_sides(
@@ -181,8 +182,8 @@ def wanted_sides(
             yield side
 
 
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__)
+def _options() -> argparse.Namespace:
+    parser = options("peers", __doc__)
     parser.add_argument("overrides", nargs="*", help="of both sides, e.g. num_envs=8192")
     parser.add_argument(
         "--only", action="append", metavar="TEXT", help="comparisons with TEXT in the name"
@@ -193,10 +194,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--timeout-s", type=float, default=600.0, help="seconds for a run")
     parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
     parser.add_argument("--runs", type=Path, help="keep the folders of runs, with logs, here")
     return parser.parse_intermixed_args()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -7,20 +7,16 @@ so their speed says nothing. Adds a call to `benchmarks/results/brax-returns-<de
 
 from __future__ import annotations
 
-import argparse
-import signal
 import sys
 import tempfile
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from benchmarks.command import start, wait_until
 from benchmarks.peers.comparisons import Comparison, brax_training
 from benchmarks.peers.side import variables_of_brax
-from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
-from gmijax.errors import ConfigError
+from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.runner import deadline, exit_code, options, start, wait_until
 from gmijax.runs.folder import read_json, write_json
 from gmijax.supervise.failures import last_line
 
@@ -55,7 +51,7 @@ def train(tasks: dict[str, dict[str, Any]], folder: Path, timeout_s: float) -> d
             command = [sys.executable, "-m", "benchmarks.peers.brax_ppo", *map(str, files[:2])]
             log = logs.enter_context(files[2].open("wb"))
             processes.append(start(command, variables_of_brax(training["suite"]), log))
-        codes = wait_until(time.monotonic() + timeout_s, *processes)
+        codes = wait_until(deadline(timeout_s), *processes)
     return {name: _run(folder, name, code) for name, code in zip(tasks, codes, strict=True)}
 
 
@@ -69,36 +65,27 @@ def _run(folder: Path, name: str, code: int) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Trains what the command line asks for; returns 1 if a run failed, 2 on bad input."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.peers.returns", description=__doc__
-    )
+    """Trains what the command line asks for; returns 1 if a run failed, else 0."""
+    parser = options("peers.returns", __doc__)
     parser.add_argument(
         "tasks", nargs="+", metavar="TASK", help="of Playground's dm_control suite"
     )
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--override", action="append", default=[], help="e.g. num_timesteps=20e6")
     parser.add_argument("--timeout-s", type=float, default=3600.0)
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
-    arguments = parser.parse_args()
-    more = tuple(arguments.override)
-    pairs = [(task, seed) for task in arguments.tasks for seed in range(arguments.seeds)]
-    try:
-        tasks = {f"{task}-{seed}": told(task, more, seed) for task, seed in pairs}
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
-    file = ResultsFile(arguments.out / file_name(SUITE, device_name()), SUITE, vars(arguments))
+    given = parser.parse_args()
+    names = {f"{task}-{seed}": (task, seed) for task in given.tasks for seed in range(given.seeds)}
+    tasks = {name: told(task, tuple(given.override), seed) for name, (task, seed) in names.items()}
+    file = ResultsFile(given.out / file_name(SUITE, device_name()), SUITE, vars(given))
     with tempfile.TemporaryDirectory() as scratch:
-        found = train(tasks, Path(scratch), arguments.timeout_s)
+        found = train(tasks, Path(scratch), given.timeout_s)
     with file.changing() as results:
-        for task, seed in pairs:
-            results.setdefault(task, []).append({"seed": seed, **found[f"{task}-{seed}"]})
+        for name, (task, seed) in names.items():
+            results.setdefault(task, []).append({"seed": seed, **found[name]})
     for name, run in found.items():
         sys.stdout.write(f"{name}: {run['returns'][-1:]} {run.get('failed', '')}\n")
     return int(any("failed" in run for run in found.values()))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -17,7 +17,7 @@ from gmijax.errors import ConfigError
 from gmijax.machine.differences import differences_in
 from gmijax.machine.snapshot import Machine
 
-_SHOWS_S = 20.0
+SHOWS_S = 20.0
 """Network file systems show what others have written late, some after seconds."""
 
 _POLL_S = 0.2
@@ -64,7 +64,7 @@ def require_shared(joined: Sequence[Joined], run_root: Path) -> None:
     try:
         with os.fdopen(fd, "w") as file:
             file.write(content)
-        deadline_s = running_s() + _SHOWS_S
+        deadline_s = running_s() + SHOWS_S
         blind = [node for node, _ in joined]
         while blind := [node for node in blind if not node.call("sees", name, content)]:
             if running_s() > deadline_s or any(node.lost for node in blind):

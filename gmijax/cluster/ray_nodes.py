@@ -59,7 +59,7 @@ class RayCluster:
         with ExitStack() as held:
             if config.address == "local":
                 held.enter_context(_for_this_job_alone())
-            self._ray: Any = _import_ray()
+            self._ray: Any = import_ray()
             if not self._ray.is_initialized():
                 self._connect(config.address)
                 held.callback(self._ray.shutdown)
@@ -264,7 +264,7 @@ class _NodeActor:
     def __init__(
         self, kind: type[Node], variables: dict[str, str], folder: str, interface: str | None
     ) -> None:
-        address = _import_ray().util.get_node_ip_address()
+        address = import_ray().util.get_node_ip_address()
         self._node = kind(variables, folder, interface, address)
         # Ray ends the actor then too, but later, and not while the raylet is a zombie.
         raylet = identify(int(os.environ.get("RAY_RAYLET_PID", "0")))
@@ -307,7 +307,8 @@ def _end_with(process: ProcessId) -> None:
     os._exit(1)
 
 
-def _import_ray() -> Any:
+def import_ray() -> Any:
+    """The package ray; raises ConfigError if it is not installed."""
     try:
         import ray
         import ray.util.scheduling_strategies

@@ -11,7 +11,9 @@ from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-_REFRESH_S = 0.25
+REFRESH_S = 0.25
+"""Between two pictures of a panel."""
+
 _BAR_WIDTH = 30
 
 
@@ -51,7 +53,7 @@ class LiveDisplay:
         `make` prints by itself what is to stay. It is called when it is time to draw.
         """
         now_s = time.monotonic()
-        if self._is_off or (self.has_panel and now_s - self._drawn_s < _REFRESH_S):
+        if self._is_off or (self.has_panel and now_s - self._drawn_s < REFRESH_S):
             return
         self._drawn_s = now_s
         self._try(lambda: self._draw(make()))

@@ -38,7 +38,7 @@ def export(config: ExportConfig, *, show: Show = False) -> ExportPaths:
       ConfigError: bad input, e.g. no such checkpoint, or a package that is not installed.
       GmiFailed: the export failed.
     """
-    _require_packages(config)
+    require_packages(config)
     config, _, changed = open_run(config)
     paths = ExportPaths(output_folder(config, "export"))
     console = open_console(show=show)
@@ -46,7 +46,7 @@ def export(config: ExportConfig, *, show: Show = False) -> ExportPaths:
     if changed:
         console.print(changed)
     with doing(console, "exporting the policy"):
-        run_gmis(_launch(paths))
+        run_gmis(launch_of(paths))
     if config.format in ("onnx", "all"):
         console.print(f"ONNX: {nearby(paths.onnx)}")
     if config.format in ("stablehlo", "all"):
@@ -61,7 +61,8 @@ def export(config: ExportConfig, *, show: Show = False) -> ExportPaths:
     return paths
 
 
-def _require_packages(config: ExportConfig) -> None:
+def require_packages(config: ExportConfig) -> None:
+    """Raises ConfigError if a format needs a package that is not installed."""
     if config.format == "stablehlo":
         return
     if importlib.util.find_spec("jax2onnx") is None:
@@ -71,7 +72,8 @@ def _require_packages(config: ExportConfig) -> None:
         )
 
 
-def _launch(paths: ExportPaths) -> Launch:
+def launch_of(paths: ExportPaths) -> Launch:
+    """The process that exports, on the CPU."""
     machine = detect_machine()
     return Launch(
         plan=make_plan(PlanConfig(backend="cpu"), ReduceConfig(), 1, machine),

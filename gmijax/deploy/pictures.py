@@ -58,7 +58,7 @@ def film(
     exit_code = EXIT_NO_GL
     for gl in tried:
         with doing(console, f"filming with {gl}"):
-            exit_code = _render(gl, paths, seconds)
+            exit_code = render(gl, paths, seconds)
         if exit_code == 0:
             for video in filter(Path.exists, (paths.mp4, paths.gif)):
                 console.print(f"video: {nearby(video)}")
@@ -81,7 +81,8 @@ def _why(exit_code: int, paths: PlayPaths) -> str:
     return f"{': '.join(filter(None, (ended, said)))} (log: {paths.render_log})"
 
 
-def _render(gl: str, paths: PlayPaths, seconds: float | None = None) -> int:
+def render(gl: str, paths: PlayPaths, seconds: float | None = None) -> int:
+    """Films in a process with this OpenGL (a value of `MUJOCO_GL`); returns its exit code."""
     own = () if seconds is None else (str(seconds),)
     with paths.render_log.open("ab") as log:
         return run_child("gmijax.workers.play_film", paths, environment_with(gl), log, *own)

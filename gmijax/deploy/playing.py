@@ -98,19 +98,19 @@ def play(config: PlayConfig, *, show: Show = False) -> None:
         if changed:
             console.print(changed)
         with doing(console, f"playing {config.num_envs} episodes"):
-            run_gmis(_launch(config, paths, detect_machine()))
+            run_gmis(launch_of(config, paths, detect_machine()))
     _show(config, paths, console)
 
 
 def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     """Prints the returns, and makes the pictures."""
     returns = read_json(paths.returns)
-    console.print(_table(returns))
+    console.print(returns_table(returns))
     if config.checkpoint != SHIPPED and (note := _return_while_training(config, returns)):
         console.print(note)
     console.print(f"returns: {nearby(paths.returns)}")
     if not paths.model.exists():
-        _accept_nothing_to_see(config, returns["env"], console)
+        without_film(config, returns["env"], console)
         print_next(console, *_next_steps(config))
         return
     try:
@@ -179,7 +179,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
             f"env={config.run.env}: a run knows its task; add checkpoint=shipped for the policy "
             "that comes with gmijax"
         )
-    checkpoint = _find(config)
+    checkpoint = checkpoint_of(config)
     early = None
     if config.checkpoint == "best" and not rank_of(checkpoint).is_full:
         early = (
@@ -201,7 +201,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     return config, env, "\n".join(filter(None, notes)) or None
 
 
-def _find(config: PlayConfig | ExportConfig | ViewConfig) -> Path:
+def checkpoint_of(config: PlayConfig | ExportConfig | ViewConfig) -> Path:
     """The checkpoint that the configuration names."""
     wanted, run_dir = config.checkpoint, config.run.dir
     if wanted in (None, "best") or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):
@@ -262,7 +262,8 @@ def output_folder(
     return root
 
 
-def _launch(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:
+def launch_of(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:
+    """The process that plays, on a machine where another job may be training."""
     one_gmi = PlanConfig(memory_fraction=MEMORY_FRACTION if machine.gpus else None)
     return Launch(
         plan=make_plan(one_gmi, ReduceConfig(), config.num_envs, machine),
@@ -276,7 +277,7 @@ def _launch(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:
     )
 
 
-def _accept_nothing_to_see(config: PlayConfig, env: str, console: Console) -> None:
+def without_film(config: PlayConfig, env: str, console: Console) -> None:
     """Says that there is no film of an environment without a model, if one was wanted."""
     reason = f"{env} has no model that could be filmed; the returns were evaluated"
     if config.video not in ("auto", "none") or config.html == "on":
@@ -285,7 +286,8 @@ def _accept_nothing_to_see(config: PlayConfig, env: str, console: Console) -> No
         console.print(reason)
 
 
-def _table(returns: Mapping[str, Any]) -> Table:
+def returns_table(returns: Mapping[str, Any]) -> Table:
+    """Means and spreads of the episodes in a `returns.json`, for people."""
     how = "without exploration noise" if returns["deterministic"] else "with exploration noise"
     diverged = returns["num_diverged"]
     table = Table(

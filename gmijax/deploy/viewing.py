@@ -40,7 +40,7 @@ def view(config: ViewConfig, *, show: bool = False) -> None:
     shown = _shipped(config) if config.checkpoint == SHIPPED else _of_run(config)
     envs = [PlainEnv(shown.env, seed=config.seed + number) for number in range(config.num_envs)]
     _require_fit(shown.policy, envs[0])
-    _require_packages()
+    require_packages()
     simulation = Simulation(envs, shown.policy, config.seed)
     _serve(config, simulation, shown, open_console(show=show))
 
@@ -82,7 +82,8 @@ def _require_fit(policy: PlainPolicy, env: PlainEnv) -> None:
         )
 
 
-def _require_packages() -> None:
+def require_packages() -> None:
+    """Raises ConfigError if a package of the viewer is not installed."""
     if absent := missing():
         raise ConfigError(f"gmijax view needs {' and '.join(absent)} ({INSTALL})")
 

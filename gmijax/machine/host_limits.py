@@ -227,17 +227,6 @@ def _threads_of_machine() -> int | None:
     return None
 
 
-def _cached_bytes(folder: Path) -> int:
-    """Cached files of a control group, which count as used, but make way."""
-    with suppress(OSError, ValueError):
-        lines = (folder / "memory.stat").read_text().splitlines()
-        counts = {name: int(value) for name, value in (line.split() for line in lines)}
-        # In version 1 those of the groups below are counted apart.
-        prefix = "total_" if "total_active_file" in counts else ""
-        return counts[f"{prefix}active_file"] + counts[f"{prefix}inactive_file"]
-    return 0
-
-
 def _number(folder: Path, names: Sequence[str]) -> int | None:
     """The number in the first of the files that has one; None for `max`."""
     for name in names:

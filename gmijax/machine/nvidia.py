@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import pynvml
 
 _MIB = 1024 * 1024
-_DEVICES = Path("/dev")
+DEVICES = Path("/dev")
+"""Where files of devices are."""
 
 
 class MigInstance(NamedTuple):
@@ -105,7 +106,7 @@ def _problem(ask: Callable[[], object]) -> str | None:
         absent = (pynvml.NVML_ERROR_LIBRARY_NOT_FOUND, pynvml.NVML_ERROR_DRIVER_NOT_LOADED)
         if getattr(error, "value", None) not in absent:
             return str(error)
-        devices = sorted(_DEVICES.glob("nvidia[0-9]*"))
+        devices = sorted(DEVICES.glob("nvidia[0-9]*"))
         return f"{error}, although there is {devices[0]}" if devices else None
     return None
 

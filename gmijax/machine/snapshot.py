@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gmijax.machine import nvidia
 from gmijax.machine.host_limits import (
     UNKNOWN_HOST,
     CgroupLimits,
@@ -32,7 +33,6 @@ _HIDES_ALL = ("", "-1", "NoDevFiles")
 DAEMONS_VARIABLE = "GMIJAX_MPS_DAEMONS"
 """Tells a job of a sweep the daemons that the sweep has for it: JSON, see `Machine.daemons`."""
 
-_DEVICES = Path("/dev")
 _OTHERS = {"kfd": "a GPU for ROCm", "accel[0-9]*": "a TPU"}
 
 
@@ -180,7 +180,7 @@ def _operator_daemon(program: Path) -> tuple[Path | None, str | None]:
     # `Path.is_dir` this takes any text, and folders of others.
     if not os.path.isdir(directory):
         return None, None
-    if not named and (owner := _strange_owner(directory)) is not None:
+    if not named and (owner := strange_owner(directory)) is not None:
         return None, (
             f"warning: {directory} belongs to user {owner}, so the MPS daemon there is not used; "
             f"{PIPE_VARIABLE}={directory} says that it is to be"
@@ -201,7 +201,7 @@ def _left_out_of_gmis() -> str | None:
     return f"warning: GMIs start without {found}, with which tasks do not work" if found else None
 
 
-def _strange_owner(directory: Path) -> int | None:
+def strange_owner(directory: Path) -> int | None:
     """Who owns a directory that everybody could have made; None if root or this user does."""
     owners = (directory.lstat().st_uid, directory.stat().st_uid)
     return next((owner for owner in owners if owner not in (0, os.geteuid())), None)
@@ -210,5 +210,5 @@ def _strange_owner(directory: Path) -> int | None:
 def _other_accelerators() -> Iterator[str]:
     """What else could compute here, as far as device files tell."""
     for pattern, what in _OTHERS.items():
-        if found := sorted(_DEVICES.glob(pattern)):
+        if found := sorted(nvidia.DEVICES.glob(pattern)):
             yield f"warning: {found[0]} looks like {what}, which gmijax does not use"

@@ -105,14 +105,14 @@ def why_not_under(strategy: str, layout: Layout, backend: str) -> str | None:
             "rings between MIG instances are not supported, because NCCL takes one of each GPU; "
             "with plan.backend=mig allowed are auto, mpr"
         )
-    if not _is_installed("nccl", "nccl.bindings"):
+    if not is_installed("nccl", "nccl.bindings"):
         return f"rings between GPUs need the package nccl4py {_INSTALL}"
     return None
 
 
 def why_no_bindings() -> str | None:
     """None if a program can hand numbers to other processes from a GPU, else the reason."""
-    if not _is_installed("cuda", "cuda.bindings"):
+    if not is_installed("cuda", "cuda.bindings"):
         return f"exchanges between GMIs on GPUs need the package cuda-bindings {_INSTALL}"
     installed = versions_of([_BINDINGS])[_BINDINGS]
     numbers = numbers_of(installed)
@@ -156,7 +156,7 @@ def is_even(layout: Layout) -> bool:
     return len({len(gmis) for gmis in layout.gmis_of_gpu}) == 1
 
 
-def _is_installed(*modules: str) -> bool:
+def is_installed(*modules: str) -> bool:
     """Whether all modules can be imported; the packages of each come before it."""
     return all(importlib.util.find_spec(module) is not None for module in modules)
 

@@ -57,16 +57,20 @@ class PlainEnv:
         randomisation and curriculum are left out, as when it is played.
       seed: of the episodes' starts, commands and goals.
 
+    Attributes:
+      physics: MuJoCo in C, which moves the world.
+      state: of the task, its arrays numpy's.
+
     Raises:
       ConfigError: not one of our own tasks, or settings that it does not have.
     """
 
     def __init__(self, config: EnvConfig, seed: int = 0) -> None:
         self._env = _plain_task(config)
-        self._world: CPhysics = self._env.model
+        self.physics: CPhysics = self._env.model
         self._task, self._settings = str(config.name), config.settings
         self._rng: Any = np.random.default_rng(seed)  # In the place of a key.
-        self._state: EnvState
+        self.state: EnvState
         self._diverged = False
         self.reset()
 
@@ -78,27 +82,27 @@ class PlainEnv:
     @property
     def model(self) -> Any:
         """The `mujoco.MjModel`."""
-        return self._world.mj_model
+        return self.physics.mj_model
 
     @property
     def data(self) -> Any:
         """The `mujoco.MjData` that `step` moves. Positions of it are overwritten by `step`."""
-        return self._world.data
+        return self.physics.data
 
     @property
     def obs(self) -> Floats:
         """The observation [O] to act on next."""
-        return np.asarray(self._state.obs, np.float32)
+        return np.asarray(self.state.obs, np.float32)
 
     @property
     def qpos(self) -> Floats:
         """Joint positions [nq], for pictures."""
-        return np.asarray(self._state.physics.qpos, np.float32)
+        return np.asarray(self.state.physics.qpos, np.float32)
 
     @property
     def steps(self) -> int:
         """Control steps since the last reset."""
-        return int(self._state.steps)
+        return int(self.state.steps)
 
     @property
     def diverged(self) -> bool:
@@ -108,7 +112,7 @@ class PlainEnv:
     @property
     def metrics(self) -> dict[str, float]:
         """What the episode has come to by now, by the names of `spec.metrics`."""
-        return {name: float(value) for name, value in self._state.metrics.items()}
+        return {name: float(value) for name, value in self.state.metrics.items()}
 
     @property
     def command(self) -> Floats | None:
@@ -116,16 +120,16 @@ class PlainEnv:
 
         It may be set, and is observed from the end of the next step on. See `command_limits`.
         """
-        task = self._state.task
+        task = self.state.task
         return np.array(task.command) if "command" in getattr(task, "_fields", ()) else None
 
     @command.setter
     def command(self, value: npt.ArrayLike) -> None:
-        told, task = self.command, self._state.task
+        told, task = self.command, self.state.task
         new = np.asarray(value, np.float32)
         if told is None or new.shape != told.shape:
             raise ValueError(f"{self._task} takes no command of shape {new.shape}")
-        self._state = self._state._replace(task=task._replace(command=new))
+        self.state = self.state._replace(task=task._replace(command=new))
 
     @property
     def command_limits(self) -> dict[str, float] | None:
@@ -140,7 +144,7 @@ class PlainEnv:
         """Starts the next episode, or with a `seed` the first one of that seed; returns [O]."""
         if seed is not None:
             self._rng = np.random.default_rng(seed)
-        self._state, self._diverged = self._env.reset(self._world, self._rng), False
+        self.state, self._diverged = self._env.reset(self.physics, self._rng), False
         return self.obs
 
     def step(self, action: npt.ArrayLike) -> Step:
@@ -148,15 +152,15 @@ class PlainEnv:
 
         A world whose numbers leave every bound ends with reward 0 (`gmijax.sim.divergence`).
         """
-        before, given = self._state, constant(action)
+        before, given = self.state, constant(action)
         with np.errstate(over="ignore", invalid="ignore"):
-            after = self._env.step(self._world, before, given)
+            after = self._env.step(self.physics, before, given)
             diverged = diverged_by_source(self._env, after)["any"]
             state = end_diverged(before, after, diverged)
         self._diverged = bool(diverged)
         if self._diverged:  # It may be filmed.
             state = state._replace(physics=before.physics)
-        self._state = state
+        self.state = state
         return Step(
             obs=self.obs,
             reward=float(state.reward),

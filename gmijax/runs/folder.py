@@ -36,7 +36,7 @@ EXIT_NO_GL = 3
 _TEMPORARY = re.compile(r"\..+\.\d+-\d+")
 """Names that files have while they are written."""
 
-_LARGEST_JSON_BYTES: Final = 1 << 28
+LARGEST_JSON_BYTES: Final = 1 << 28
 """More than any file that gmijax writes, and little enough to be read by mistake."""
 
 
@@ -244,9 +244,9 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     try:
         with open_regular(path) as file:
-            content = file.read(_LARGEST_JSON_BYTES + 1)
-        if len(content) > _LARGEST_JSON_BYTES:
-            raise OSError(errno.EFBIG, f"larger than {_LARGEST_JSON_BYTES >> 20} MiB")
+            content = file.read(LARGEST_JSON_BYTES + 1)
+        if len(content) > LARGEST_JSON_BYTES:
+            raise OSError(errno.EFBIG, f"larger than {LARGEST_JSON_BYTES >> 20} MiB")
         data: object = json.loads(content)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None

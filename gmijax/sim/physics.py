@@ -39,15 +39,15 @@ from gmijax.types import Array, PRNGKey, PyTree
 
 T = TypeVar("T")
 
-# Bits of MJX-Warp's `overflow`: what did not fit, and limits that are meant: of iterations, and of
-# triangles of a height field below one geom, which MuJoCo in C has too.
-_CONSTRAINT_BITS, _LIMIT_BITS, _ALL_BITS = 0x003, 0x620, 0xFFF
-_CONTACT_BITS = _ALL_BITS & ~(_CONSTRAINT_BITS | _LIMIT_BITS)
+CONSTRAINT_BITS, LIMIT_BITS, ALL_BITS = 0x003, 0x620, 0xFFF
+"""Bits of MJX-Warp's `overflow`: what did not fit, and limits that are meant: of iterations, and
+of triangles of a height field below one geom, which MuJoCo in C has too."""
+CONTACT_BITS = ALL_BITS & ~(CONSTRAINT_BITS | LIMIT_BITS)
 
 
 def which_overflowed(bits: Array) -> Array:
     """[2] bool, which of `OVERFLOWS` were too small, by a world's `overflow` [] of MJX-Warp."""
-    return (bits & jnp.array([_CONTACT_BITS, _CONSTRAINT_BITS])) != 0
+    return (bits & jnp.array([CONTACT_BITS, CONSTRAINT_BITS])) != 0
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ def in_jax(task: str, monkeypatch: pytest.MonkeyPatch) -> tuple[Env, list[Any]]:
             return after, found
 
     with monkeypatch.context() as patch:
-        patch.setattr(simulators, "load", lambda *_, **__: World(plain._world))
+        patch.setattr(simulators, "load", lambda *_, **__: World(plain.physics))
         module = __import__(TASKS[task], fromlist=["make"])
         return module.make(), signals
 
@@ -93,9 +93,9 @@ def test_starts_are_the_same(task: str, monkeypatch: pytest.MonkeyPatch):
         state = env.reset(env.model, jax.random.key(seed))
         assert isinstance(state.obs, jax.Array)
         assert_close(plain.obs, state.obs)
-        assert_close(plain._state.physics.qvel, state.physics.qvel)
+        assert_close(plain.state.physics.qvel, state.physics.qvel)
         assert_close(plain.qpos, state.physics.qpos)
-        assert_trees_equal(plain._state.task, state.task)
+        assert_trees_equal(plain.state.task, state.task)
 
 
 @pytest.mark.parametrize("task", task_names())
@@ -112,7 +112,7 @@ def test_steps_are_the_same(task: str, monkeypatch: pytest.MonkeyPatch):
     key = jax.random.key(0)
     same_draws(monkeypatch, 3, in_jax=False)
     for _ in range(STEPS):
-        before, action = plain._state, rng.uniform(-1.5, 1.5, env.spec.action_size)
+        before, action = plain.state, rng.uniform(-1.5, 1.5, env.spec.action_size)
         plain.step(action)
         data = {name: floats(getattr(plain.data, name)) for name in (*READ, "qpos", "qvel")}
         start = jax.tree.map(
@@ -126,7 +126,7 @@ def test_steps_are_the_same(task: str, monkeypatch: pytest.MonkeyPatch):
         )
         after, ctrl = step(data, start, floats(action))
         assert_close(plain.data.ctrl, ctrl)
-        ours = plain._state
+        ours = plain.state
         assert_close(ours.obs, after.obs)
         assert_close(ours.reward, after.reward)
         assert ours.reward_terms.keys() == after.reward_terms.keys() == set(env.spec.reward_terms)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.evaluation import check
+from benchmarks.cases import SUITES
+from benchmarks.evaluation import check, tables
 from benchmarks.evaluation.figures import look_up
 from benchmarks.evaluation.page import TABLES
 from gmijax.errors import ConfigError
@@ -24,6 +25,15 @@ def findings(folder: Path, text: str) -> list[str]:
 def test_every_figure_of_the_documents_is_that_of_its_file():
     # `python -m benchmarks evaluation` writes what is marked, and says what a table is called.
     assert [str(finding) for finding in check.check()] == []
+
+
+def test_lgr_is_what_algorithm_1_of_the_paper_takes():
+    taken = {"2G2T": "mrr", "2G3T": "har", "4G4T": "mrr"}
+    pairs = [f"{at} {way}" for at, strategy in taken.items() for way in ("mpr", strategy)]
+    assert [case.name for case in SUITES["lgr-ant"]] == pairs
+    assert {at: tables.algorithm_1(at) for at in tables.LAYOUTS} == taken
+    measured = tables.gain_of("ant", "2G2T", "mrr")  # By itself, in a file of its own.
+    assert measured.ratio == pytest.approx(0.99, abs=0.005)
 
 
 def test_every_table_stands_in_one_page_of_the_evaluation():

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import subprocess
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -65,9 +68,15 @@ def test_an_old_file_is_one_call_whose_origin_is_unknown_and_stays(file: Path):
 
 def test_the_commit_of_a_checkout_is_found(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv(COMMIT_VARIABLE, raising=False)
-    monkeypatch.setattr(records, "_git", lambda verb, *_: {"rev-parse": "abc"}.get(verb, " M a"))
+    answers = {"rev-parse": "abc\n", "status": " M a\n"}
+
+    def run(command: Sequence[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        answer = answers.get(command[1])
+        return subprocess.CompletedProcess(command, answer is None, answer or "", "")
+
+    monkeypatch.setattr(records.subprocess, "run", run)
     assert records.code_version() == ("abc", True)
-    monkeypatch.setattr(records, "_git", lambda *_: None)
+    answers.clear()
     assert records.code_version() == (None, None)
 
 

@@ -106,7 +106,7 @@ def test_without_ray_or_a_cluster_the_line_says_what_to_do(
         def init(**_: Any) -> None:
             raise ConnectionError("Could not find any running Ray instance.\nMore words.")
 
-    monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
+    monkeypatch.setattr(ray_nodes, "import_ray", Ray)
     with pytest.raises(ConfigError, match=r"address=auto: no cluster .*`ray start --head`"):
         RayCluster(ClusterConfig(), Node)
     with pytest.raises(ConfigError, match=r"address=127\.0\.0\.1:1: nothing answers there"):
@@ -140,7 +140,7 @@ def test_an_address_that_cannot_be_is_refused(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ray = SimpleNamespace(is_initialized=lambda: False)
-    monkeypatch.setattr(ray_nodes, "_import_ray", lambda: ray)
+    monkeypatch.setattr(ray_nodes, "import_ray", lambda: ray)
     with pytest.raises(ConfigError, match=r"expected auto, local or host:port with a port from 1"):
         RayCluster(ClusterConfig(address=address), Node)
 
@@ -150,7 +150,7 @@ def test_a_name_of_a_host_that_cannot_be_is_one_nobody_answers_at(
     host: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ray = SimpleNamespace(is_initialized=lambda: False)
-    monkeypatch.setattr(ray_nodes, "_import_ray", lambda: ray)
+    monkeypatch.setattr(ray_nodes, "import_ray", lambda: ray)
     with pytest.raises(ConfigError, match="nothing answers there"):
         RayCluster(ClusterConfig(address=f"{host}:6379"), Node)
 
@@ -174,7 +174,7 @@ def test_a_cluster_for_one_job_has_a_token_of_its_own_and_is_for_this_machine_al
             if len(seen) > 4:
                 raise ConnectionError("no")
 
-    monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
+    monkeypatch.setattr(ray_nodes, "import_ray", Ray)
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("RAY_AUTH_TOKEN", "of the user")
     before = dict(os.environ)
@@ -213,7 +213,7 @@ def test_fewer_nodes_than_asked_for_are_refused_once_the_wait_is_over(
         def wait(*_: Any, **__: Any) -> None:
             """Nothing is asked."""
 
-    monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
+    monkeypatch.setattr(ray_nodes, "import_ray", Ray)
     cluster = RayCluster(ClusterConfig(wait_s=0.0), Node)
     with pytest.raises(ConfigError, match="nodes=2: the cluster has 1 nodes with 2 CPUs, and no"):
         cluster.join(2, 2)
@@ -289,7 +289,7 @@ def test_the_doctor_says_in_what_nodes_differ() -> None:
 def test_a_run_folder_that_a_node_does_not_see_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gmijax.cluster.checks._SHOWS_S", 0.0)
+    monkeypatch.setattr("gmijax.cluster.checks.SHOWS_S", 0.0)
     with pytest.raises(ConfigError, match=r"node 10\.0\.0\.2 does not see .* or cannot write"):
         require_shared(joined(a_node(sees=False)), tmp_path / "runs" / "new")
     require_shared(joined(a_node(sees=True)), tmp_path / "runs" / "new")

@@ -70,7 +70,7 @@ def test_what_is_no_json_object_is_one_line(
 
 
 def test_a_file_without_an_end_is_not_read_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(folder, "_LARGEST_JSON_BYTES", 1 << 20)
+    monkeypatch.setattr(folder, "LARGEST_JSON_BYTES", 1 << 20)
     path = tmp_path / "file.json"
     with path.open("wb") as file:
         file.truncate(1 << 40)

@@ -148,7 +148,7 @@ def test_without_its_package_only_stablehlo_can_be_written(
         assert f"format={wanted}: needs the package jax2onnx (pip install" in said
         assert len(said.splitlines()) == 1
     assert not (run.root / "export").exists()
-    exporting._require_packages(exporting_config("format=stablehlo"))
+    exporting.require_packages(exporting_config("format=stablehlo"))
 
 
 def exporting_config(*overrides: str) -> ExportConfig:
@@ -165,7 +165,7 @@ def test_an_export_leaves_a_gpu_to_the_job_that_trains_on_it(
     config, _, _ = exporting.open_run(exporting_config(f"run.dir={run.root}"))
     paths = ExportPaths(exporting.output_folder(config, "export"))
     assert paths == ExportPaths(run.root / "export" / f"{ENV_STEPS:012d}")
-    environment = environment_of(exporting._launch(paths), 0, {})
+    environment = environment_of(exporting.launch_of(paths), 0, {})
     assert (environment["JAX_PLATFORMS"], environment["CUDA_VISIBLE_DEVICES"]) == ("cpu", "")
 
 

@@ -29,7 +29,7 @@ def test_a_fall_back_to_host_memory_is_told(
     said: dict[str, str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
+    monkeypatch.setattr("gmijax.partition.reduction.is_installed", lambda *_: True)
     plan = make_plan(machine(1), {"strategy": planned}, gmis_per_gpu=2, backend="share")
     comm: Any = SimpleNamespace(strategy=strategy, intra=intra)
     assert exchange_used(plan, comm) == said

@@ -126,4 +126,4 @@ def test_what_is_executed_is_what_was_looked_at(tmp_path: Path):
     py_compile.compile(
         str(other), str(cached), invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH
     )
-    assert custom._load(file, digest).VALUE == 1
+    assert custom.load_module(file, digest).VALUE == 1

@@ -100,7 +100,7 @@ def test_auto_exchanges_on_gpus_where_it_can_else_by_algorithm_1_and_says_why(
     why: str,
     monkeypatch: pytest.MonkeyPatch,
 ):
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: is_installed)
+    monkeypatch.setattr(reduction, "is_installed", lambda *_: is_installed)
     plan = planned(machine(0 if backend == "cpu" else 2), reduce, backend=backend, **changes)
     assert plan.strategy == strategy
     (reason,) = [text for text in plan.reasons if text.startswith("strategy")]

@@ -88,7 +88,7 @@ def test_what_cannot_be_is_refused(changes, said: str) -> None:
 def test_jobs_are_told_that_experience_could_stay_on_the_gpu(
     overrides: tuple[str, ...], is_told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    monkeypatch.setattr(reduction, "is_installed", lambda *_: True)
     here, share = machine(2), ("env=ant", "algo=a3c", "plan.backend=share")
     plan = training_plan(compose(*share, *overrides), here)
     assert any("channel.transport=device keeps" in why for why in plan.reasons) == is_told

@@ -61,7 +61,7 @@ def test_gmis_of_nodes_share_the_gpus_of_their_node() -> None:
 def test_nodes_with_gpus_do_inside_what_one_machine_does(
     gpus: int, gmis: int, strategy: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
+    monkeypatch.setattr("gmijax.partition.reduction.is_installed", lambda *_: True)
     plan = plan_on(gpus_of_nodes(gpus, gpus), gpus=gpus, gmis_per_gpu=gmis)
     assert plan.strategy == strategy
     assert [stage.transport for stage in stages(strategy, plan.layout)][-1] == "nodes"

@@ -60,7 +60,7 @@ def test_the_latest_checkpoint_is_played_unless_one_is_named(
         ((f"run.dir={run.root}", "checkpoint=best"), best),
         (("checkpoint=best",), best),
     ):
-        assert playing._find(config_of(*overrides)) == expected
+        assert playing.checkpoint_of(config_of(*overrides)) == expected
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_a_checkpoint_that_cannot_be_meant_is_bad_input(
     other = shutil.copytree(run.root, tmp_path / "runs" / "y")
     config = config_of(*(text.format(run=run.root, other=other) for text in overrides))
     with pytest.raises(ConfigError, match=message):
-        playing._find(config)
+        playing.checkpoint_of(config)
 
 
 def test_worlds_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytest.MonkeyPatch):
@@ -130,7 +130,7 @@ def test_worlds_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytes
 def test_playing_leaves_a_gpu_to_the_job_that_trains_on_it(run: RunPaths):
     machine = Machine(gpus=(Gpu(0, "GPU-1", "some GPU", 80000, (9, 0), False),), cpu_cores=(0, 1))
     config = config_of(f"run.dir={run.root}", "num_envs=4", "video_envs=1")
-    launch = playing._launch(config, PlayPaths(run.root), machine)
+    launch = playing.launch_of(config, PlayPaths(run.root), machine)
     environment = environment_of(launch, 0, {})
     assert environment["XLA_CLIENT_MEM_FRACTION"] == "0.1"
     assert environment["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
@@ -152,7 +152,7 @@ def test_every_opengl_is_tried_the_users_first(
         # -11: a driver that crashes is no reason to give up either.
         return {"glfw": EXIT_NO_GL, "egl": -11, "osmesa": 0}[gl]
 
-    monkeypatch.setattr(pictures, "_render", render)
+    monkeypatch.setattr(pictures, "render", render)
     pictures.film(config_of(), PlayPaths(tmp_path), "camera track", quiet)
     assert tried == ["glfw", "egl", "osmesa"]
 
@@ -170,7 +170,7 @@ def test_a_renderer_that_fails_for_another_reason_says_why(
 ):
     paths = PlayPaths(tmp_path)
     paths.render_log.write_text("Traceback\nOSError: disk full\n")
-    monkeypatch.setattr(pictures, "_render", lambda *_: exit_code)
+    monkeypatch.setattr(pictures, "render", lambda *_: exit_code)
     with pytest.raises(GmijaxError, match=f"no video: {why}.*log: "):
         pictures.film(config_of("video=auto"), paths, "camera track", quiet)
 
@@ -179,7 +179,7 @@ def test_without_opengl_only_a_film_that_was_asked_for_is_an_error(
     tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(pictures, "_render", lambda *_: EXIT_NO_GL)
+    monkeypatch.setattr(pictures, "render", lambda *_: EXIT_NO_GL)
     paths = PlayPaths(tmp_path)
     paths.render_log.write_text("Traceback\nImportError: no library\n")
     pictures.film(config_of("video=auto"), paths, "camera track", quiet)
@@ -189,11 +189,11 @@ def test_without_opengl_only_a_film_that_was_asked_for_is_an_error(
 
 def test_a_film_that_was_asked_for_of_a_task_without_a_model_is_an_error(quiet: Console):
     with pytest.raises(GmijaxError, match="point has no model that could be filmed; the returns"):
-        playing._accept_nothing_to_see(config_of("video=gif"), "point", quiet)
+        playing.without_film(config_of("video=gif"), "point", quiet)
 
 
 def test_a_missing_opengl_is_noticed_by_the_child(tmp_path: Path):
     pytest.importorskip("mujoco")
     write_json(RunPaths(tmp_path).config, to_dict(config_of()))
-    code = pictures._render("no-such-gl", PlayPaths(tmp_path))
+    code = pictures.render("no-such-gl", PlayPaths(tmp_path))
     assert code == EXIT_NO_GL, PlayPaths(tmp_path).render_log.read_text()

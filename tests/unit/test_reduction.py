@@ -115,10 +115,10 @@ def test_what_a_backend_lacks_names_strategy_layout_and_reason(
 def test_device_exchange_says_why_it_is_not_to_be_had(
     backend: str, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: False)
+    monkeypatch.setattr(reduction, "is_installed", lambda *_: False)
     assert reason in (why_not_intra("ipc", backend) or "")
     assert why_not_intra("host", backend) is None
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    monkeypatch.setattr(reduction, "is_installed", lambda *_: True)
     assert (why_not_intra("ipc", backend) is None) == (backend in ("mps", "share"))
 
 
@@ -129,7 +129,7 @@ def test_device_exchange_says_why_it_is_not_to_be_had(
 def test_bindings_that_hold_up_python_are_too_old(
     version: str | None, is_enough: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    monkeypatch.setattr(reduction, "is_installed", lambda *_: True)
     monkeypatch.setattr(reduction, "versions_of", lambda names: dict.fromkeys(names, version))
     reason = why_not_intra("ipc", "mps")
     assert (reason is None) == is_enough

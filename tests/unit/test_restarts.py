@@ -257,7 +257,7 @@ def test_a_lost_gpu_shrinks_the_plan(
     layout: str,
     devices: list[int],
 ):
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    monkeypatch.setattr(reduction, "is_installed", lambda *_: True)
     config = compose(
         *("env=ant", "plan.backend=share", "num_envs=64", "run.elastic=true"),
         *("reduce.intra=host", *overrides),

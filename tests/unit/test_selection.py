@@ -21,7 +21,7 @@ plan = partial(planned, MACHINE)
 
 @pytest.fixture(autouse=True)
 def with_bindings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    monkeypatch.setattr(reduction, "is_installed", lambda *_: True)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from gmijax.errors import SelfCheckFailed
 from gmijax.selfcheck import PRECISIONS, SIZES, Precision, check_share, compare_products
 
 MEASURED = Path(__file__).parents[2] / "benchmarks/results/sm-shares-nvidia-h200.json"
-RIGHT = selfcheck._multiply
+RIGHT = selfcheck.multiply
 SMALL = ((64, 128, 32), (32, 64, 96))
 
 
@@ -58,7 +58,7 @@ def test_right_products_pass():
 def test_wrong_products_are_found(
     multiply: Callable[..., jax.Array], wrong: set[str], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(selfcheck, "_multiply", multiply)
+    monkeypatch.setattr(selfcheck, "multiply", multiply)
     found = list(compare_products(SMALL))
     assert {product.precision.name for product in found if product.is_wrong} == wrong
 
@@ -68,7 +68,7 @@ def test_a_wrong_share_is_named(monkeypatch: pytest.MonkeyPatch):
     capped = dataclasses.replace(plan.slices[0], device="GPU-0", sm_percent=33.0)
     plan = dataclasses.replace(plan, slices=(capped,))
     monkeypatch.setattr(selfcheck, "SIZES", SMALL)
-    monkeypatch.setattr(selfcheck, "_multiply", one_tile_missing)
+    monkeypatch.setattr(selfcheck, "multiply", one_tile_missing)
     with pytest.raises(
         SelfCheckFailed,
         match=r"wrong on GPU-0 with plan\.sm_percent=33: bfloat16, float16 \(cublaslt, cublas\); ",

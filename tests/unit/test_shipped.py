@@ -74,7 +74,7 @@ def test_a_task_is_named_for_shipped_policies_only(
 
 
 def test_a_shipped_policy_is_played_as_a_checkpoint_is(policies: Path):
-    config = demo._play_config("ball_balance")
+    config = demo.play_config("ball_balance")
     paths = shipping.folder_of(shipping.checked(config))
     assert paths.root == policies.parent / "runs" / "shipped" / "ball_balance"
     assert plain_playback.main([str(paths.root)]) == 0
@@ -92,14 +92,14 @@ def test_a_shipped_policy_is_played_as_a_checkpoint_is(policies: Path):
 
 
 def test_without_time_only_as_many_are_played_as_are_filmed(policies: Path):
-    paths = shipping.folder_of(demo._play_config("ball_balance"))
+    paths = shipping.folder_of(demo.play_config("ball_balance"))
     assert plain_playback.main([str(paths.root), "0"]) == 0
     assert read_json(paths.returns)["num_envs"] == 4
 
 
 def test_an_unknown_camera_is_one_line(policies: Path, capsys: pytest.CaptureFixture[str]):
-    paths = shipping.folder_of(demo._play_config("ball_balance"))
-    config = to_dict(demo._play_config("ball_balance"))
+    paths = shipping.folder_of(demo.play_config("ball_balance"))
+    config = to_dict(demo.play_config("ball_balance"))
     write_json(RunPaths(paths.root).config, {**config, "camera": "x"})
     assert plain_playback.main([str(paths.root)]) == 2
     assert capsys.readouterr().err.startswith("camera=x: unknown camera of ball_balance; allowed")

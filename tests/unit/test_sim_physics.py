@@ -213,9 +213,9 @@ def test_a_buffer_of_warp_that_is_too_small_is_noticed(
 def test_bits_of_overflow_are_those_of_warp():
     pytest.importorskip("warp")
     kinds = importlib.import_module("mujoco.mjx.third_party.mujoco_warp._src.types").OverflowType
-    assert physics._CONSTRAINT_BITS == kinds.NEFC | kinds.NJMAX_NNZ
-    assert physics._LIMIT_BITS == kinds.ITERATIONS | kinds.LS_ITERATIONS | kinds.HFIELD
-    assert physics._ALL_BITS == kinds.ALL
+    assert physics.CONSTRAINT_BITS == kinds.NEFC | kinds.NJMAX_NNZ
+    assert physics.LIMIT_BITS == kinds.ITERATIONS | kinds.LS_ITERATIONS | kinds.HFIELD
+    assert physics.ALL_BITS == kinds.ALL
 
 
 def test_worlds_of_several_jobs_move_as_those_of_one():

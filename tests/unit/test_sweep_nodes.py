@@ -444,7 +444,7 @@ def test_nodes_with_gpus_are_taken_where_there_are_any(
         wait = staticmethod(lambda *_, **__: None)
 
     placed: list[Any] = []
-    monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
+    monkeypatch.setattr(ray_nodes, "import_ray", Ray)
     monkeypatch.setattr(RayCluster, "_place", lambda _, bundle, n, __: placed.append((n, bundle)))
     monkeypatch.setattr(RayCluster, "_joined", lambda _: [])
     cluster = RayCluster(ClusterConfig(wait_s=0.0), Node)

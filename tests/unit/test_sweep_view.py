@@ -118,7 +118,7 @@ def test_a_value_of_a_window_that_is_not_full_is_marked_where_it_is_shown() -> N
 def test_an_error_of_the_view_ends_the_view_alone(
     what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(display, "_REFRESH_S", 0.0)
+    monkeypatch.setattr(display, "REFRESH_S", 0.0)
     terminal, jobs = Terminal(), running_jobs()
     monkeypatch.setattr(sys, "stdout", terminal)
     with SweepView(open_console(show=True), jobs, SWEEP) as view:

@@ -30,13 +30,13 @@ def test_a_step_on_a_gpu_is_a_graph_from_what_is_given_to_what_is_taken(
     peaks: list[object] = []
     monkeypatch.setattr(worlds, "mjx_warp", fake)
     monkeypatch.setattr(worlds, "PEAKS_BESIDE_JAX", peaks)
-    worlds._count_memory.cache_clear()
+    worlds.count_memory.cache_clear()
     layout = layout_with(mass_rows)
     model = SimpleNamespace(opt=SimpleNamespace(iterations=4))
     made = Worlds(model, SUBSTEPS, WarpSizes(5, 9), layout)
     own = {"body_mass": COUNT} if mass_rows == COUNT else {}
     assert fake.made == [{"batch_sizes": own, "nworld": COUNT, "naconmax": 15, "njmax": 9}]
-    assert not made._model.opt.graph_conditional
+    assert not made.model.opt.graph_conditional
 
     given, taken = np.zeros(layout.num_given, np.float32), np.empty(0)
     rng = np.random.default_rng(0)
@@ -68,4 +68,4 @@ def test_a_solver_with_many_iterations_asks_whether_it_is_done(
     monkeypatch.setattr(worlds, "PEAKS_BESIDE_JAX", [])
     model = SimpleNamespace(opt=SimpleNamespace(iterations=iterations))
     made = Worlds(model, SUBSTEPS, WarpSizes(1, 1), layout_with(1))
-    assert made._model.opt.graph_conditional is asks
+    assert made.model.opt.graph_conditional is asks

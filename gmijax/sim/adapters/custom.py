@@ -61,7 +61,7 @@ def make(
     given = {key: value for key, value in changes.items() if value}
     what = f"env={path.name}:{function}"
     with importable(path.parent):
-        module = attempt(f"env={path}", _load, path, source_sha256)
+        module = attempt(f"env={path}", load_module, path, source_sha256)
         found = getattr(module, function, None)
         if not callable(found):
             names = [key for key, value in vars(module).items() if inspect.isfunction(value)]
@@ -114,7 +114,7 @@ def _require_argument(function: Callable[..., Any], group: str, what: str) -> No
         raise ConfigError(f"env.{group}: {what} has no argument `{group}` to take it")
 
 
-def _load(path: Path, source_sha256: str | None) -> ModuleType:
+def load_module(path: Path, source_sha256: str | None) -> ModuleType:
     """Runs the file as a module."""
     text = path.read_bytes()
     if source_sha256 not in (None, hashlib.sha256(text).hexdigest()):

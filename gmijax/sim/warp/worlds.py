@@ -122,6 +122,9 @@ class Worlds:
       substeps: physics steps of a control step.
       sizes: of the buffers for contacts and constraints.
       layout: of the buffer.
+
+    Attributes:
+      model: MuJoCo Warp's.
     """
 
     def __init__(
@@ -131,10 +134,10 @@ class Worlds:
         count = layout.given["qpos"].shape[0]
         leaves = {name: layout.given[name] for name in MODEL_LEAVES if name in layout.given}
         own = {name: count for name, piece in leaves.items() if piece.shape[0] == count > 1}
-        self._model: Any = mujoco_warp.put_model(mj_model, batch_sizes=own)
-        self._model.opt.graph_conditional = mj_model.opt.iterations > _UNASKED
+        self.model: Any = mujoco_warp.put_model(mj_model, batch_sizes=own)
+        self.model.opt.graph_conditional = mj_model.opt.iterations > _UNASKED
         # Reaching that limit is meant; Warp would print a line for each world and step.
-        self._model.opt.warn_overflow = 0
+        self.model.opt.warn_overflow = 0
         self._data: Any = mujoco_warp.make_data(
             mj_model,
             nworld=count,
@@ -150,12 +153,12 @@ class Worlds:
                 floats = self._buffer[piece.start : piece.start + piece.size]
                 self._switches = floats, self._data.eq_active.flatten()
             else:
-                self._move(self._model if name in leaves else self._data, name, piece)
+                self._move(self.model if name in leaves else self._data, name, piece)
         self._given: Any = self._buffer[: layout.num_given]
         self._taken: Any = self._buffer[layout.first_taken :]
         self._graph: Any = None
         if self._buffer.device.is_mempool_supported:
-            _count_memory(self._buffer.device.alias)
+            count_memory(self._buffer.device.alias)
 
     def _move(self, owner: Any, name: str, piece: Piece) -> None:
         """Puts an array of the model or of the data into the buffer."""
@@ -204,10 +207,10 @@ class Worlds:
         # Rows without a constraint are multiplied by zero, which does not help against infinity.
         self._data.efc.J.zero_()
         for _ in range(self._substeps):
-            mjx_warp.mujoco_warp.step(self._model, self._data)
+            mjx_warp.mujoco_warp.step(self.model, self._data)
 
 
 @functools.cache
-def _count_memory(device: str) -> None:
+def count_memory(device: str) -> None:
     """Adds Warp's memory to that of JAX, once for each device."""
     PEAKS_BESIDE_JAX.append(functools.partial(mjx_warp.warp.get_mempool_used_mem_high, device))

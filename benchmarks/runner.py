@@ -1,0 +1,181 @@
+"""Runs the commands of benchmarks: in turn, in time, and at the same time where GPUs are free."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, TypeVar
+
+from benchmarks.records import RESULTS
+from gmijax.errors import ConfigError
+
+STOP_S = 15.0
+"""For a command that meets its deadline to save and end."""
+
+_ROOT = Path(__file__).resolve().parents[1]
+
+Case = TypeVar("Case", bound=Hashable)
+
+
+def options(prog: str, about: str | None) -> argparse.ArgumentParser:
+    """A parser of `python -m benchmarks.PROG`, with the option that all benchmarks have."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m benchmarks.{prog}",
+        description=about,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
+    return parser
+
+
+def exit_code(main: Callable[[], int]) -> int:
+    """What `main` returns; 2 and one line on bad input, 130 if SIGINT or SIGTERM ends it."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return main()
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+def deadline(seconds: float | None) -> float:
+    """So many seconds from now on the clock of `time.monotonic`; None: never."""
+    return time.monotonic() + (math.inf if seconds is None else seconds)
+
+
+def in_turn(
+    cases: Sequence[Case],
+    repeats: int,
+    deadline_s: float = math.inf,
+    like: Callable[[Case], Hashable] = lambda case: case,
+) -> Iterator[tuple[int, Case]]:
+    """The number of the repeat and the case: every case once before one comes twice.
+
+    A case that would not end in time is left out. It is expected to take as long as the longest
+    one before that is like it; the time of a case is what passes until the next one is asked for.
+    """
+    longest_s: dict[Hashable, float] = {}
+    for repeat in range(repeats):
+        for case in cases:
+            started_s, kind = time.monotonic(), like(case)
+            if started_s + longest_s.get(kind, 0.0) >= deadline_s - STOP_S:
+                continue
+            yield repeat, case
+            longest_s[kind] = max(longest_s.get(kind, 0.0), time.monotonic() - started_s)
+
+
+def start(
+    command: Sequence[str], variables: Mapping[str, str], output: IO[bytes] | None = None
+) -> subprocess.Popen[bytes]:
+    """Starts a command.
+
+    Args:
+      command: with its arguments.
+      variables: of the environment, beside those of this process.
+      output: where its output goes; None: where that of this process goes.
+    """
+    return subprocess.Popen(
+        command,
+        env={**os.environ, **variables},
+        stdout=output,
+        stderr=output,
+        start_new_session=True,  # So that Ctrl-C comes to it once.
+    )
+
+
+def wait_until(deadline_s: float, *processes: subprocess.Popen[bytes]) -> list[int]:
+    """Waits for processes; asks them to save and end in time, or when this is interrupted.
+
+    Those that do not are killed.
+
+    Args:
+      deadline_s: on the clock of `time.monotonic`; they are asked `STOP_S` before.
+      processes: that were started.
+
+    Returns:
+      Their exit codes, negative for a signal.
+    """
+    try:
+        for process in processes:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, deadline_s - STOP_S - time.monotonic()))
+    finally:
+        running = [process for process in processes if process.poll() is None]
+        for process in running:
+            process.send_signal(signal.SIGINT)
+        killed_s = time.monotonic() + STOP_S
+        for process in running:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, killed_s - time.monotonic()))
+            process.kill()
+    return [process.wait() for process in processes]
+
+
+def run_command(
+    command: Sequence[str], deadline_s: float, variables: Mapping[str, str] | None = None
+) -> int:
+    """Runs one command, see `start` and `wait_until`; returns its exit code."""
+    return wait_until(deadline_s, start(command, variables or {}))[0]
+
+
+def failure_of(command: Sequence[str], folder: Path | None = None) -> str | None:
+    """Runs a command; the last line that it wrote to stderr if it failed, else None.
+
+    `folder` is what it works in, with the gmijax of this checkout; None: that of this process.
+    """
+    path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        env=None if folder is None else {**os.environ, "PYTHONPATH": path},
+        check=False,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+    return lines[-1] if done.returncode else None
+
+
+def as_word(text: str) -> str:
+    """Letters and digits only: a name of a folder that is a value on a command line."""
+    return re.sub(r"[^a-zA-Z0-9]+", "-", text)
+
+
+class FreeGpus:
+    """The GPUs that are free, by index; usable from any thread.
+
+    Attributes:
+      count: how many there are.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._free = set(range(count))
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def taken(self, count: int = 1) -> Iterator[tuple[int, ...]]:
+        """Takes `count` of them once so many are free."""
+        with self._changed:
+            self._changed.wait_for(lambda: len(self._free) >= count)
+            mine = sorted(self._free)[:count]
+            self._free.difference_update(mine)
+        try:
+            yield tuple(mine)
+        finally:
+            with self._changed:
+                self._free.update(mine)
+                self._changed.notify_all()
