@@ -147,7 +147,7 @@ def test_the_watch_of_a_step_looks_at_those_who_have_arrived_after_it(
     first, *others = barriers_of(blocks, 0.3, 30.0, 30.0)
     done = threading.Event()
     with ThreadPoolExecutor(3) as pool:
-        meeting = [pool.submit(other.wait, is_patient=True) for other in others]
+        meeting = [pool.submit(other.wait, while_unresponsive=True) for other in others]
         threading.Timer(1.5, done.set).start()
         first.watch(done)  # They wait for this one, and are not late.
         first.wait()

@@ -44,7 +44,8 @@ class LockstepRunner:
         barrier.check_same_call()
         with barrier.raise_peer_failure():
             result = self._thread.run(program, barrier.watch)
-        barrier.wait(is_patient=True)  # Some have given it to their devices a step before others.
+        # Some have given it to their devices a step before others.
+        barrier.wait(while_unresponsive=True)
         barrier.end()
         return result
 

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
 from gmijax.clock import running_s
 from gmijax.collectives.host.failure_detector import FailureDetector
@@ -72,41 +73,41 @@ class Barrier:
         word |= (call_index & 0xFFFF) << CALL_INDEX_SHIFT
         self._block.lines["call"][rank, self.step % 2] = word
 
-    def wait(self, *, is_patient: bool = False) -> None:
+    def wait(self, *, while_unresponsive: bool = False) -> None:
         """Arrives, and waits until all ranks have arrived here.
 
         What a rank wrote before is visible to all after it, and what it read before is read.
 
         Args:
-          is_patient: time only counts while one of those who have not arrived is silent.
+          while_unresponsive: time only counts while a rank that has not arrived is unresponsive.
 
         Raises:
           PeerLost: the process of a rank that has not arrived is gone.
           CollectiveTimeout: ranks did not arrive in time.
         """
         self._arrive()
-        self._wait(is_patient=is_patient)
+        self._wait(while_unresponsive=while_unresponsive)
 
     def watch(self, done: threading.Event) -> None:
         """Waits for a step that this rank's device runs together with the others'.
 
         Returns when `done` is set. Devices of ranks that have come out of the step may still be
-        at it, so all peers are looked at, and time only counts while one of them is silent. If
-        all are caught in it, the controller will see that nothing goes on.
+        at it, so all peers are looked at, and time only counts while one of them is unresponsive.
+        If all are caught in it, the controller will see that nothing goes on.
 
         Raises:
           PeerLost: the process of a peer is gone.
-          CollectiveTimeout: a peer is silent, or all have come out of it but this rank.
+          CollectiveTimeout: a peer is unresponsive, or all have come out of it but this rank.
         """
         detector = self._detector()
         while not done.wait(LIVENESS_PERIOD_S):
-            detector.look(lambda: self._peers, is_patient=True)
+            detector.look(lambda: self._peers, while_unresponsive=True)
             if detector.is_late:
                 detector.give_up(self._peers)
 
     @contextmanager
     def raise_peer_failure(self) -> Iterator[None]:
-        """If a step fails because a peer has ended or is silent, says so.
+        """If a step fails because a peer has ended or is unresponsive, says so.
 
         Raises:
           PeerLost, CollectiveTimeout: see `watch`; an error that no peer explains stays as it is.
@@ -147,8 +148,8 @@ class Barrier:
         while running_s() < deadline_s:
             detector.look(lambda: self._peers)
             time.sleep(0.02)
-        if silent := detector.silent(self._peers):
-            detector.give_up(silent)
+        if unresponsive := detector.unresponsive(self._peers):
+            detector.give_up(unresponsive)
 
     def _arrive(self) -> None:
         self._fence()
@@ -165,7 +166,7 @@ class Barrier:
                     f"{own}, and {sizes[peer]} for {other}"
                 )
 
-    def _wait(self, *, is_patient: bool = False) -> None:
+    def _wait(self, *, while_unresponsive: bool = False) -> None:
         target, missing = int(self._sequence[self._block.rank]), self._peers
         detector = self._detector()
 
@@ -175,7 +176,8 @@ class Barrier:
             return None if missing else True
 
         def look() -> None:
-            detector.look(lambda: self._missing(self._peers, target), is_patient=is_patient)
+            late = partial(self._missing, self._peers, target)
+            detector.look(late, while_unresponsive=while_unresponsive)
 
         wait_until(arrived, look, math.inf)
         self._fence()

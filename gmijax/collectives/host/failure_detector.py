@@ -35,12 +35,12 @@ class FailureDetector:
         """Whether the time is up."""
         return self._waited_s() >= self._timeout_s
 
-    def look(self, missing: Callable[[], list[int]], *, is_patient: bool = False) -> None:
+    def look(self, missing: Callable[[], list[int]], *, while_unresponsive: bool = False) -> None:
         """Looks at those who are missing; to be called five times a second.
 
         Args:
           missing: ranks that have not arrived, read anew at every call.
-          is_patient: the time starts anew while all who are missing are heard of.
+          while_unresponsive: the time starts anew while all who are missing are heard of.
 
         Raises:
           PeerLost: the process of one of them is gone.
@@ -50,7 +50,7 @@ class FailureDetector:
         self._check_alive(missing)
         self._listen()
         left = missing()
-        if is_patient and left and not self.silent(left):
+        if while_unresponsive and left and not self.unresponsive(left):
             self._clock_s = running_s()
         elif left and self.is_late:
             self.give_up(left)
@@ -58,12 +58,12 @@ class FailureDetector:
     def give_up(self, missing: list[int]) -> NoReturn:
         """Raises CollectiveTimeout for those of `missing` who do not wait themselves.
 
-        A rank that has given up and is still on its way out is silent too, and not the cause.
+        A rank that has given up and is still ending is unresponsive too, and not the cause.
         """
-        silent = self.silent(missing) or missing
-        self._raise_timeout([peer for peer in silent if not self._block.suspect[peer]] or silent)
+        peers = self.unresponsive(missing) or missing
+        self._raise_timeout([peer for peer in peers if not self._block.suspect[peer]] or peers)
 
-    def silent(self, missing: list[int]) -> list[int]:
+    def unresponsive(self, missing: list[int]) -> list[int]:
         """Those of `missing` who do not wait themselves, as far as this rank has heard."""
         since_s, never = running_s() - SILENCE_S, (0, self._start_s)
         return [peer for peer in missing if self._heard.get(peer, never)[1] < since_s]

@@ -113,7 +113,7 @@ class SharedMemoryGroup:
         self.barrier.begin("all_gather", values.size)
         region = block.gathered[self.barrier.step % 2]
         region[self.rank, : values.size] = values
-        self._meet()
+        self._synchronize()
         gathered = region[:, : values.size].copy()
         self.barrier.end()
         return gathered
@@ -167,10 +167,10 @@ class SharedMemoryGroup:
         self.barrier.begin(operation, source.size, call_index)
         slots = block.slots[self.barrier.step % 2, :, : source.size]
         slots[self.rank] = source
-        self._meet()
+        self._synchronize()
         return slots, _group_of(self.rank, groups)
 
-    def _meet(self) -> None:
+    def _synchronize(self) -> None:
         self.barrier.wait()
         self.barrier.check_same_call()
 
