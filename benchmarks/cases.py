@@ -84,7 +84,7 @@ def _templates(task: str, num_envs: int) -> tuple[Case, ...]:
         *(f"env={task}", f"num_envs={num_envs}", f"num_timesteps={12 * 32 * 2 * num_envs}"),
         *("plan.backend=mps", "run.measure_throughput=false", "run.checkpoint_every=0"),
         # Both as the paper has them: gradients through host memory.
-        "reduce.selection=paper",
+        "reduce.strategy=paper",
     )
     return (
         Case(f"2 GMIs x {num_envs}, tcg_ex", (*shared, "plan.gmis_per_gpu=2")),

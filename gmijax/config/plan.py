@@ -136,32 +136,11 @@ class ReduceConfig(KeyGroup):
 
     prefix = "reduce."
 
-    strategy: Literal["auto", StrategyName] = doc(
-        "reduction strategy; auto: by the layout, see selection", default="auto"
-    )
-    intra: Literal["auto", "host", "ipc"] = doc(
-        "exchange inside one GPU, for har: through host memory, or through GPU memory that GMIs "
-        "map (ipc); auto: ipc where it can be had; host leaves out one_shot",
+    strategy: Literal["auto", "paper", StrategyName] = doc(
+        "reduction strategy; auto: by the layout, one_shot where several GMIs share a GPU and can "
+        "map its memory; paper: by the layout alone, the paper's Algorithm 1",
         default="auto",
     )
     timeout_s: float = doc(
         "longest wait for another GMI in one exchange, seconds", default=120.0, positive=True
     )
-    selection: Literal["paper", "device", "measured"] = doc(
-        "what strategy=auto goes by: the paper's Algorithm 1 (paper), the same but one_shot where "
-        "several GMIs share a GPU and can map its memory (device), or the time that every "
-        "strategy takes here, measured before the job starts and kept for the next one (measured)",
-        default="device",
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.strategy == "one_shot" and self.intra == "host":
-            raise ConfigError(
-                "reduce.intra=host: reduce.strategy=one_shot goes through memory of the GPUs; "
-                "allowed are auto, ipc"
-            )
-        if self.selection == "measured" and self.strategy != "auto":
-            raise ConfigError(
-                f"reduce.selection=measured: needs reduce.strategy=auto, not {self.strategy}"
-            )

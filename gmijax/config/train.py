@@ -49,11 +49,6 @@ class TrainConfig(KeyGroup):
             ("decoupled",) if isinstance(self.algo, A3cConfig) else ("tcg_ex", "tdg_ex"),
             f"gmijax.train with algo={self.algo.name}",
         )
-        if self.plan.template == "tdg_ex" and self.reduce.selection == "measured":
-            raise ConfigError(
-                "reduce.selection=measured: for jobs in which every GMI trains; with "
-                "plan.template=tdg_ex allowed are paper, device"
-            )
         renews = isinstance(self.algo, PpoConfig) and self.algo.recompute_advantages
         if renews and self.plan.template == "tdg_ex":
             raise ConfigError(
@@ -83,15 +78,11 @@ class TrainConfig(KeyGroup):
         return self.num_envs
 
     def _check_on_nodes(self) -> None:
-        for key, value, allowed in (
-            ("plan.template", self.plan.template, ("auto", "tcg_ex", "decoupled")),
-            ("reduce.selection", self.reduce.selection, ("paper", "device")),
-        ):
-            if value not in allowed:
-                raise ConfigError(
-                    f"{key}={value}: not with cluster.engine={self.cluster.engine} yet; allowed "
-                    f"are {', '.join(allowed)}"
-                )
+        if self.plan.template not in (allowed := ("auto", "tcg_ex", "decoupled")):
+            raise ConfigError(
+                f"plan.template={self.plan.template}: not with "
+                f"cluster.engine={self.cluster.engine} yet; allowed are {', '.join(allowed)}"
+            )
         for key, value in (
             ("num_envs", self.num_envs),
             ("plan.gmis_per_gpu", self.plan.gmis_per_gpu),

@@ -56,7 +56,6 @@ def train_summary(
             **_of_plan(plan),
             "strategy": result.get("strategy", plan.strategy),
             "intra": result.get("intra", plan.intra),
-            "selection": dict(plan.selection),
         },
         "env_steps": result.get("env_steps"),
         "wall_s": wall_s,

@@ -7,7 +7,7 @@ A plan is made by `gmijax.partition.planner` from the configuration and the mach
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from gmijax.config import BackendName, Priority, TemplateName
@@ -55,8 +55,6 @@ class Plan:
     self_check: bool = False  # Every GMI compares matrix products with float64 when it starts.
     # Where the daemons of `mps` cannot be started, the GMIs may take turns instead.
     may_share: bool = False
-    # With `reduce.selection=measured` what the paper says and what was measured.
-    selection: Mapping[str, Any] = field(default_factory=dict)
     # Addresses of the nodes of the layout, in order; none in a job on one machine.
     nodes: tuple[str, ...] = ()
 
@@ -113,4 +111,5 @@ class Plan:
         )
         fields["reasons"] = tuple(data["reasons"])
         fields["roles"] = tuple(data["roles"])
+        fields.pop("selection", None)  # Plans of older versions have it.
         return cls(**fields)

@@ -210,19 +210,20 @@ def _reduction(
             "that train must have as many of them on as many GPUs, numbered in order of the nodes"
         )
     strategy = _strategy(reduce, training.layout, backend, reasons)
-    return strategy, _intra(reduce, strategy, layout, backend, reasons)
+    return strategy, _intra(strategy, backend, reasons)
 
 
 def _strategy(
     reduce: ReduceConfig, layout: Layout, backend: BackendName, reasons: list[str]
 ) -> str:
     """How those that train, in `layout`, average gradients; `none` if there is only one."""
-    if reduce.strategy != "auto":
+    is_named = reduce.strategy not in ("auto", "paper")
+    if is_named:
         require_strategy(reduce.strategy, layout, backend)
     if layout.num_gmis == 1:
         reasons.append("strategy none: no gradient reduction (one GMI)")
         return "none"
-    if reduce.strategy != "auto":
+    if is_named:
         return reduce.strategy
     paper, why = select_strategy(layout)
     no_ring = why_not_under(paper, layout, backend)
@@ -232,11 +233,11 @@ def _strategy(
     # With one GMI on each GPU one ring over all is as fast.
     wants_one_shot = no_ring is not None or not is_one_per_gpu(layout)
     wants_one_shot &= layout.of_node(0).num_gmis > 1
-    wants_one_shot &= reduce.selection == "device" and reduce.intra != "host"
+    wants_one_shot &= reduce.strategy == "auto"
     if wants_one_shot and no_one_shot is None:
         reasons.append(
             "strategy one_shot: GMIs that share GPUs train faster with exchanges on them; "
-            f"Algorithm 1 says {paper} ({why}), as reduce.selection=paper does"
+            f"Algorithm 1 says {paper} ({why}), as reduce.strategy=paper does"
         )
         return "one_shot"
     # Under other backends there is no memory of a GPU to share, whatever is installed.
@@ -249,15 +250,7 @@ def _strategy(
     return paper
 
 
-def _intra(
-    reduce: ReduceConfig, strategy: str, layout: Layout, backend: BackendName, reasons: list[str]
-) -> str:
-    if reduce.intra != "auto":
-        if reason := why_not_intra(reduce.intra, backend):
-            raise ConfigError(
-                f"reduce.intra={reduce.intra}: cannot run on layout {layout}: {reason}; use host"
-            )
-        return reduce.intra
+def _intra(strategy: str, backend: BackendName, reasons: list[str]) -> str:
     if reason := why_not_intra("ipc", backend):
         if strategy != "none":
             reasons.append(

@@ -129,11 +129,10 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", f"{A3C} plan.gpus=100 plan.serving_gmis_per_gpu=11", "at most 1024 are allowed"),
     ("train", f"{A3C} plan.training_gpus=1e9", "at most 1024 are allowed"),
     ("train", "plan.layout=[[0,2]]", "GMI ids must be 0 to 1"),
-    ("train", "reduce.strategy=telepathy", "expected one of auto, mpr, mrr, har, flat"),
+    ("train", "reduce.strategy=telepathy", "expected one of auto, paper"),
     ("train", "reduce.strategy=mrr plan.layout=[[0,1],[2]]", "cannot run on layout [[0,1],[2]]"),
     ("train", "reduce.strategy=mrr plan.gmis_per_gpu=2", "mrr: cannot run on layout [[0,1]]: its"),
     ("train", "reduce.strategy=flat plan.gmis_per_gpu=2", "NCCL before 2.30"),
-    ("train", "reduce.strategy=one_shot reduce.intra=host", "goes through memory of the GPUs;"),
     # What is changed about a task.
     ("train", "env=ant env.rewards.enrgy=1", "env.rewards.enrgy: did you mean energy?"),
     ("train", "env=anymal env.rewards.x=1", "env.rewards.x: allowed are torque, velocity, y"),
@@ -146,8 +145,6 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "env=ant env.curriculum=on", "env.curriculum=on: ant has none; allowed are anymal"),
     ("train", "env.history=0", "env.history=0: must be at least 1"),
     ("train", "env.action_repeat=0", "env.action_repeat=0: must be at least 1"),
-    ("train", "reduce.intra=ipc plan.gmis_per_gpu=2", "reduce.intra=ipc: cannot run on layout"),
-    ("train", "reduce.strategy=mpr reduce.selection=measured", "needs reduce.strategy=auto, not"),
     ("serve", "policy=random plan.template=tcg_ex", "not for gmijax.serve; allowed are auto, tcg"),
     ("serve", "policy=random plan.template=tgc", "plan.template=tgc: expected one of auto, tcg"),
     # Folders and policies.
@@ -185,7 +182,6 @@ REFUSED: list[tuple[str, str, str]] = [
     ("search", f"{A3C} plan.serving_gpus=1", "plan.training_gpus=null: there must be serving"),
     ("search", f"{A3C} plan.layout=[[0],[1]]", "plan.layout=[[0], [1]]: with the decoupled"),
     ("search", f"{A3C} search.training_gmis_per_gpu=[]", "search.training_gmis_per_gpu=[]: exp"),
-    ("search", f"{A3C} reduce.selection=measured", "reduce.selection=measured"),
     # What is hardly a command line.
     ("train", "-env=\n", "unknown option -env=\\n: allowed"),
     ("train", "\r", r"'\r': expected text without control characters"),
