@@ -180,7 +180,7 @@ _GO1 = (
     *("num_timesteps=100e6", "eval.every=10e6", "seed={run}", "run.measure_throughput=false"),
 )
 _ASYNC_LONG = ("algo=a3c", "plan.backend=mps", "channel.capacity_mib=256")
-_ON_ONE = ("channel.transport=device", "plan.mps_priority=trainers_first")
+_ON_ONE = "channel.transport=device"
 
 SUITES = MappingProxyType(
     {
@@ -202,7 +202,7 @@ SUITES = MappingProxyType(
         "async-long": (
             _long("1 GPU, synchronous", 1, 8192),
             _long(
-                *("1 GPU, 2 agents + 1 trainer", 1, 4096, *_ASYNC_LONG, *_ON_ONE),
+                *("1 GPU, 2 agents + 1 trainer", 1, 4096, *_ASYNC_LONG, _ON_ONE),
                 "plan.serving_gmis_per_gpu=2",
             ),
             _long("2 GPUs, synchronous", 2, 8192, "plan.gpus=2"),

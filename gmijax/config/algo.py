@@ -110,7 +110,8 @@ class ActorCriticConfig(KeyGroup):
 class PpoConfig(ActorCriticConfig):
     """Hyper-parameters of PPO, with Brax's names."""
 
-    name: Literal["ppo"] = doc("training algorithm")
+    # algo= sets it.
+    name: Literal["ppo"] = "ppo"
     clipping_epsilon: float = doc("clip range of the probability ratio", positive=True)
     clip_value_loss: bool = doc("clip the value loss with clipping_epsilon too")
     recompute_advantages: bool = doc(
@@ -143,7 +144,8 @@ class PpoConfig(ActorCriticConfig):
 class A3cConfig(ActorCriticConfig):
     """Hyper-parameters of asynchronous actor-critic training, with Brax's names."""
 
-    name: Literal["a3c"] = doc("training algorithm")
+    # algo= sets it.
+    name: Literal["a3c"] = "a3c"
     weights_every: int | None = doc(
         "environment steps after which, at the latest, an agent takes up newer weights, within an "
         "unroll too; null: with every unroll",

@@ -12,7 +12,6 @@ from gmijax.errors import ConfigError
 BackendName = Literal["mps", "mig", "share", "cpu"]
 StrategyName = Literal["mpr", "mrr", "har", "flat", "one_shot"]
 TemplateName = Literal["tcg", "tdg", "tcg_ex", "tdg_ex", "decoupled"]
-Priority = Literal["normal", "below_normal"]
 
 MAX_GMIS = 1024
 """More processes than one host can run; making a plan of far more would take all its memory."""
@@ -62,15 +61,6 @@ class PlanConfig(KeyGroup):
         high=1.0,
     )
     template: Literal["auto", TemplateName] = doc("how roles map to GMIs", default="auto")
-    mps_priority: Literal["trainers_first"] | tuple[Priority, ...] | None = doc(
-        "whose kernels go first where several wait for a GPU (MPS): trainers_first, or one of "
-        "normal, below_normal for each GMI; null: all alike",
-        default=None,
-    )
-    force_sm_percent: bool = doc(
-        "take an sm_percent at which wrong matrix products were reported (docs/shares.md)",
-        default=False,
-    )
     self_check: Literal["auto", "on", "off"] = doc(
         "compare matrix products with float64 when a GMI starts; auto: where SMs are capped, or "
         "an MPS daemon of somebody else may cap them",
@@ -115,11 +105,6 @@ class PlanConfig(KeyGroup):
         if self.layout is not None:
             return len(self.layout)
         return self.gpus if isinstance(self.gpus, int) else len(self.gpus)
-
-    @property
-    def needs_mps(self) -> bool:
-        """Whether something is wanted that only MPS has."""
-        return self.sm_percent is not None or self.mps_priority is not None
 
     def require_template(self, allowed: Iterable[TemplateName], why: str) -> None:
         """Raises ConfigError unless `template` is `auto` or one of those `allowed`."""

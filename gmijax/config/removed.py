@@ -29,6 +29,33 @@ REMOVED: Final[Mapping[str, Removed]] = MappingProxyType(
             "the GPU where it can",
             ("auto",),
         ),
+        "channel.transfer_kib": Removed(
+            "the size of transfers is found by trying",
+            (None,),
+        ),
+        "plan.mps_priority": Removed(
+            "all GMIs of a GPU have the same priority, as was the default",
+        ),
+        "plan.force_sm_percent": Removed(
+            "give plan.sm_percent one of the values that docs/shares.md calls clean",
+        ),
+        "search.mode": Removed(
+            "every profile runs all GMIs of a GPU at once, as corun did",
+        ),
+        "search.alpha": Removed("a row of sizes ends at 0.1, as was the default"),
+        "search.tolerance": Removed("differences of 2 % are ignored, as was the default"),
+        "search.iterations": Removed("a profile has 6 iterations, as was the default"),
+        "search.profile_timeout_s": Removed(
+            "a profile may take half of search.budget_s; write twice the value there",
+        ),
+        "search.training_gmis_per_gpu": Removed(
+            "training GMIs are as many as plan.training_gmis_per_gpu says; search for each number",
+        ),
+        "run.exchange_timeout_s": Removed(
+            "a GMI that serves waits for another for 120 s, or for run.stall_timeout_s if that "
+            "is less",
+        ),
+        "output.compress": Removed("compress the shards afterwards"),
     }
 )
 """By dotted name."""

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from gmijax.config import BackendName, Priority, TemplateName
+from gmijax.config import BackendName, TemplateName
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
 
@@ -29,8 +29,6 @@ class Slice:
     # Fraction of the device's memory, None where memory is not partitioned.
     memory_fraction: float | None
     cpus: tuple[int, ...]  # CPU cores that the process is pinned to; empty for no pinning.
-    # Of its kernels among those of the GPU's other GMIs (MPS), None where all are alike.
-    priority: Priority | None = None
 
 
 @dataclass(frozen=True)
@@ -102,14 +100,19 @@ class Plan:
 
     @classmethod
     def _from_dict(cls, data: Mapping[str, Any]) -> Plan:
-        fields = dict(data)
+        fields = _without(data, "selection")
         nodes = tuple(node["address"] for node in data.get("nodes", ()))
         rows = tuple(tuple(gmis) for gmis in data["layout"])
         fields["nodes"], fields["layout"] = nodes, Layout(rows, max(1, len(nodes)))
         fields["slices"] = tuple(
-            Slice(**{**item, "cpus": tuple(item["cpus"])}) for item in data["slices"]
+            Slice(**{**_without(item, "priority"), "cpus": tuple(item["cpus"])})
+            for item in data["slices"]
         )
         fields["reasons"] = tuple(data["reasons"])
         fields["roles"] = tuple(data["roles"])
-        fields.pop("selection", None)  # Plans of older versions have it.
         return cls(**fields)
+
+
+def _without(data: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """Plain data without a key that plans of older versions have."""
+    return {name: value for name, value in data.items() if name != key}

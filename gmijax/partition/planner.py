@@ -68,7 +68,7 @@ def make_plan(
     of_nodes = node_layouts(layout, machine, nodes)
     backend = _backend(plan, of_nodes, chosen in ("tcg", "tdg"), reasons)
     roles = roles_of(chosen, layout, trainers)
-    slices, gpus = _slices(plan, of_nodes, backend, roles, reasons)
+    slices, gpus = _slices(plan, of_nodes, backend, reasons)
     if plan.template == "auto":
         reasons.append(f"template {chosen}: {DESCRIPTIONS[chosen]}")
     strategy, intra = _reduction(reduce, layout, roles, backend, reasons)
@@ -109,7 +109,6 @@ def _slices(
     plan: PlanConfig,
     of_nodes: Sequence[NodeLayout],
     backend: BackendName,
-    roles: Sequence[str],
     reasons: list[str],
 ) -> tuple[tuple[Slice, ...], tuple[Gpu, ...]]:
     """The share of every GMI of its machine, in order of id, and the GPUs of the job."""
@@ -125,8 +124,7 @@ def _slices(
                 require_host(here.num_gmis, what, plan, node.machine)
             if backend != "cpu":
                 gpus = choose_gpus(plan, here, node.machine, backend, said)
-            theirs = [roles[gmi] for gmi in node.gmis]
-            shares = make_slices(plan, here, gpus, backend, node.machine, theirs, said)
+            shares = make_slices(plan, here, gpus, backend, node.machine, said)
         for share in shares:
             gmi, gpu = node.gmis[share.gmi], share.gpu + num_gpus
             slices[gmi] = dataclasses.replace(share, gmi=gmi, gpu=gpu)
@@ -186,7 +184,7 @@ def _self_check(
 
 
 def _may_share(plan: PlanConfig, gpus: Sequence[Gpu], backend: BackendName) -> bool:
-    takes_turns_else = plan.backend == "auto" and backend == "mps" and not plan.needs_mps
+    takes_turns_else = plan.backend == "auto" and backend == "mps" and plan.sm_percent is None
     return takes_turns_else and all(gpu.compute_mode == "default" for gpu in gpus)
 
 

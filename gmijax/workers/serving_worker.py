@@ -121,7 +121,7 @@ def _writer(config: ServeConfig, rank: int, first: int, policy: ActingPolicy) ->
         "deterministic": config.deterministic,
     }
     paths = DataPaths(Path(str(config.output.dir)))
-    return ShardWriter(paths, rank, first, about, compress=config.output.compress)
+    return ShardWriter(paths, rank, first, about)
 
 
 def _reducer(config: ServeConfig, plan: Plan, link: ChildLink) -> Reducer:

@@ -165,7 +165,6 @@ REFUSED: list[tuple[str, str, str]] = [
     ("search", "search.num_envs=[]", "search.num_envs=[]: expected distinct numbers"),
     ("search", "search.num_envs=[0]", "search.num_envs=0: must be at least 1"),
     ("search", "search.impls=[cuda]", "search.impls=cuda: allowed are jax, warp"),
-    ("search", "search.alpha=-1", "search.alpha=-1.0: must be at least 0"),
     ("search", "search.budget_s=2", "search.budget_s=2: too small for one profile"),
     ("search", "plan.backend=mps", "plan.backend=mps"),
     (
@@ -174,14 +173,11 @@ REFUSED: list[tuple[str, str, str]] = [
         "not for a search (numbers that are auto); allowed are auto, tcg_ex",
     ),
     ("search", "plan.layout=[]", "plan.layout=[]: every GPU needs at least one GMI"),
-    ("search", f"{A3C} search.mode=both", "search.mode=both: with algo=a3c allowed is corun"),
     ("search", f"{A3C} plan.serving_gpus=[0,1] plan.training_gpus=[1]", APART),
     ("search", f"{A3C} plan.serving_gmis_per_gpu=3", "give search.gmis_per_gpu=[3], or"),
-    ("search", f"{A3C} plan.training_gmis_per_gpu=2", "give search.training_gmis_per_gpu=[2]"),
     ("search", f"{A3C} plan.gmis_per_gpu=4", "plan.gmis_per_gpu=4: with the decoupled template"),
     ("search", f"{A3C} plan.serving_gpus=1", "plan.training_gpus=null: there must be serving"),
     ("search", f"{A3C} plan.layout=[[0],[1]]", "plan.layout=[[0], [1]]: with the decoupled"),
-    ("search", f"{A3C} search.training_gmis_per_gpu=[]", "search.training_gmis_per_gpu=[]: exp"),
     # What is hardly a command line.
     ("train", "-env=\n", "unknown option -env=\\n: allowed"),
     ("train", "\r", r"'\r': expected text without control characters"),
