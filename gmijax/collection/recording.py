@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import statistics
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -67,7 +67,8 @@ class ShardWriter:
         }
         shard = self._paths.shard(self._rank, index)
         content = io.BytesIO()
-        np.savez(content, **arrays)
+        save: Callable[..., None] = np.savez  # For pyright, an array may be called `allow_pickle`.
+        save(content, **arrays)
         # On the disk before its JSON file is, which says that the shard is there.
         write_bytes(shard.arrays, content.getvalue())
         write_json(
