@@ -18,8 +18,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from gmijax.baselines.tdg_steps import infer, next_keys, simulate
 from gmijax.collection.collectors import Share
-from gmijax.collection.programs import Step, infer, next_keys, simulate
+from gmijax.collection.programs import Step
 from gmijax.collectives.messages.pipe import Message, PipeReader, PipeWriter
 from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.errors import PipeClosed

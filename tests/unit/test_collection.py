@@ -15,15 +15,13 @@ import pytest
 from toy_env import point_mass
 
 import gmijax
+from gmijax.baselines.tdg_steps import infer, next_keys, simulate
 from gmijax.collection.programs import (
     ActingPolicy,
     Keep,
     Step,
     _trained,
-    infer,
-    next_keys,
     random_policy,
-    simulate,
     unroll,
 )
 from gmijax.collection.recording import CollectionStats, ShardWriter
