@@ -69,7 +69,7 @@ def _templates(task: str, num_envs: int) -> tuple[Case, ...]:
     # host memory.
     shared = (
         f"env={task} num_envs={num_envs} num_timesteps={12 * 32 * 2 * num_envs} plan.backend=mps "
-        f"{_NO_RATES} {_NO_CHECKPOINTS} reduce.selection=paper"
+        f"{_NO_RATES} {_NO_CHECKPOINTS} reduce.strategy=paper"
     )
     return (
         _case(f"2 GMIs x {num_envs}, tcg_ex", f"{shared} plan.gmis_per_gpu=2"),
@@ -172,7 +172,7 @@ _CARTPOLE = (
     f"{_NO_RATES}"
 )
 _A3C = "algo=a3c plan.backend=mps channel.capacity_mib=256"
-_ON_ONE = "channel.transport=device plan.mps_priority=trainers_first plan.serving_gmis_per_gpu=2"
+_ON_ONE = "channel.transport=device plan.serving_gmis_per_gpu=2"
 _ONE_EACH, _SEVERAL = "one process each", "4 agents + 2 trainers"
 
 SUITES = MappingProxyType(

@@ -15,10 +15,10 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.reduction_jobs import Probe, candidates, measure
 from benchmarks.runner import exit_code, options
 from gmijax.collectives.strategies import BYTES_PER_FLOAT, predicted_s
 from gmijax.config import PlanConfig, ReduceConfig
-from gmijax.control.strategy_selection import Probe, candidates, measure
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.layout import Layout

@@ -23,7 +23,7 @@ from gmijax.autotune import tuner
 from gmijax.cli.grid import SweepHelp
 from gmijax.cli.pack import PackKeys
 from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig, ViewConfig
-from gmijax.control import decide, searching, strategy_selection
+from gmijax.control import decide, searching
 from gmijax.deploy import exporting, playing, viewing
 from gmijax.machine.snapshot import Machine
 from gmijax.sweeps import runner
@@ -90,7 +90,6 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
         patch.setattr(Path, "mkdir", _mkdir)
         patch.setattr(tempfile, "mkstemp", _would_start)
         patch.setattr(tuner.Search, "result", _would_start)
-        patch.setattr(strategy_selection, "measure", _would_start)
         for owner, name in ((subprocess, "Popen"), (os, "fork"), (os, "posix_spawn")):
             patch.setattr(owner, name, _must_not_start)
         yield

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from gmijax.autotune.grid import Measured
 from gmijax.config import A3cConfig, TrainConfig
+from gmijax.config.search import PROFILED_ITERATIONS
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.history import read_metrics
@@ -32,7 +33,6 @@ class Enough:
 
     def __init__(self, config: TrainConfig, plan: Plan, run: RunPaths) -> None:
         agents, trainers = groups_of(plan)
-        self._iterations = config.search.iterations
         self._agents = agents.gmis
         assert isinstance(config.algo, A3cConfig)
         # Those that may wait for every trainer, one on its way, and one that is being made.
@@ -51,7 +51,7 @@ class Enough:
         lines = read_metrics(self._metrics)
         if self._first is None:
             self._first = len(lines) + 1  # The line that has begun does not count.
-        start = window_start(lines[:-1], self._iterations)
+        start = window_start(lines[:-1], PROFILED_ITERATIONS)
         return start is not None and start >= self._first
 
 

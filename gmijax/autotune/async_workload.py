@@ -17,9 +17,10 @@ from typing import Any, Final
 
 from gmijax.autotune.async_profile import Enough, measured_of, window_start
 from gmijax.autotune.grid import Measured, Point
-from gmijax.autotune.workloads import Mode, Split, Workload, peak_memory_mib, results_of
+from gmijax.autotune.workloads import Split, Workload, peak_memory_mib, results_of
 from gmijax.config import AUTO, PlanConfig, TrainConfig
 from gmijax.config.schema import to_dict
+from gmijax.config.search import PROFILED_ITERATIONS
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.placement import place, serving_and_training
@@ -42,11 +43,6 @@ class A3cWorkload(Workload[TrainConfig]):
     template = "decoupled"
 
     def __init__(self, config: TrainConfig) -> None:
-        if config.search.mode != "corun":
-            raise ConfigError(
-                f"search.mode={config.search.mode}: with algo=a3c allowed is corun, because "
-                "agents and trainers do nothing without each other"
-            )
         super().__init__(config, training_kind(config), config.reduce)
         given = _without_auto(config.plan)
         place(given)
@@ -65,9 +61,7 @@ class A3cWorkload(Workload[TrainConfig]):
             serving_gmis_per_gpu=1,
             training_gmis_per_gpu=1,
         )
-        self.trainers = (
-            config.search.training_gmis_per_gpu if is_auto else (given.training_gmis_per_gpu,)
-        )
+        self.trainers = given.training_gmis_per_gpu
 
     @property
     def key(self) -> Mapping[str, Any]:
@@ -78,7 +72,7 @@ class A3cWorkload(Workload[TrainConfig]):
             "algo": to_dict(config.algo),
             "channel": to_dict(config.channel),
             "placement": "apart" if self._is_apart else "together",
-            "iterations": config.search.iterations,
+            "iterations": PROFILED_ITERATIONS,
         }
 
     def config_at(self, point: Point, num_gmis: int) -> TrainConfig:
@@ -88,9 +82,8 @@ class A3cWorkload(Workload[TrainConfig]):
         # It ends when there is enough to read.
         return self.with_point(point, num_timesteps=_ENDLESS_STEPS, run=run)
 
-    def plan_at(self, point: Point, mode: Mode, machine: Machine) -> Plan:
+    def plan_at(self, point: Point, machine: Machine) -> Plan:
         """See `Workload`; on one GPU that does both, or on one that acts and one that trains."""
-        del mode
         plan = _with_gmis(self._profiled_on(), point)
         return training_plan(dataclasses.replace(self.config, plan=plan), machine, point.num_envs)
 
@@ -114,7 +107,7 @@ class A3cWorkload(Workload[TrainConfig]):
     def read(self, plan: Plan, run: RunPaths) -> Measured:
         """See `Workload`; raises ValueError for too few lines of metrics."""
         lines = read_metrics(run.metrics)[:-1]  # The last may hold the end of the job.
-        start = window_start(lines, self.config.search.iterations)
+        start = window_start(lines, PROFILED_ITERATIONS)
         if start is None:
             raise ValueError(f"{len(lines)} lines of metrics are too few")
         num_agents = len(groups_of(plan)[0].gmis)
@@ -190,19 +183,14 @@ def _with_gmis(plan: PlanConfig, point: Point) -> PlanConfig:
 
 
 def _without_auto(plan: PlanConfig) -> PlanConfig:
-    """The plan as if nothing were `auto` in it; raises ConfigError for numbers that are given."""
+    """The plan as if nothing were `auto` in it; raises ConfigError for a number that is given."""
     if plan.gmis_per_gpu != AUTO:
         return plan
-    for key, where in (
-        ("serving_gmis_per_gpu", "search.gmis_per_gpu"),
-        ("training_gmis_per_gpu", "search.training_gmis_per_gpu"),
-    ):
-        if (value := getattr(plan, key)) != 1:
-            raise ConfigError(
-                f"plan.{key}={value}: is searched for with plan.gmis_per_gpu=auto; give "
-                f"{where}=[{value}], or plan.gmis_per_gpu=1 to have plan.serving_gmis_per_gpu "
-                "and plan.training_gmis_per_gpu as they are"
-            )
+    if (value := plan.serving_gmis_per_gpu) != 1:
+        raise ConfigError(
+            f"plan.serving_gmis_per_gpu={value}: is searched for with plan.gmis_per_gpu=auto; "
+            f"give search.gmis_per_gpu=[{value}], or plan.gmis_per_gpu=1 to have it as it is"
+        )
     return dataclasses.replace(plan, gmis_per_gpu=1)
 
 

@@ -70,13 +70,7 @@ class Grid(NamedTuple):
     gmis_per_gpu: tuple[int, ...]
     num_envs: tuple[int, ...]
     impls: tuple[str, ...]
-    trainers: tuple[int, ...] = (0,)
-
-
-def as_printed(grid: Grid) -> Grid:
-    """The grid in the paper's order: from the most GMIs down, from the smallest size up."""
-    rows = tuple(sorted(grid.gmis_per_gpu, reverse=True))
-    return grid._replace(gmis_per_gpu=rows, num_envs=tuple(sorted(grid.num_envs)))
+    trainers: int = 0  # Of every point; they are not searched for.
 
 
 def coarse(grid: Grid) -> Grid:
@@ -85,29 +79,21 @@ def coarse(grid: Grid) -> Grid:
     The row with the fewest GMIs comes first: it starts soonest, and all others are measured by it.
     """
     sizes = sorted(grid.num_envs, reverse=True)[::_STRIDE]
-    return Grid(
-        _some_rows(grid.gmis_per_gpu),
-        tuple(sorted(sizes[:_COARSE_SIZES])),
-        grid.impls,
-        _some_rows(grid.trainers),
+    rows = sorted(grid.gmis_per_gpu, reverse=True)
+    return grid._replace(
+        gmis_per_gpu=tuple(sorted({*rows[::_STRIDE], rows[-1]})),
+        num_envs=tuple(sorted(sizes[:_COARSE_SIZES])),
     )
 
 
 def neighbours(point: Point, grid: Grid) -> list[Point]:
-    """The points one step away in the grid: in GMIs, in trainers, then in environments."""
+    """The points one step away in the grid: in GMIs, then in environments."""
     rows = _beside(point.gmis_per_gpu, sorted(grid.gmis_per_gpu))
-    trainers = _beside(point.trainers, sorted(grid.trainers))
     sizes = _beside(point.num_envs, sorted(grid.num_envs))
     return [
         *(point._replace(gmis_per_gpu=row) for row in rows),
-        *(point._replace(trainers=number) for number in trainers),
         *(point._replace(num_envs=size) for size in sizes),
     ]
-
-
-def _some_rows(values: Sequence[int]) -> tuple[int, ...]:
-    rows = sorted(values, reverse=True)
-    return tuple(sorted({*rows[::_STRIDE], rows[-1]}))
 
 
 def _beside(value: int, values: Sequence[int]) -> list[int]:

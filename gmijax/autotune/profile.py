@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
-from gmijax.autotune.workloads import Mode, Workload
+from gmijax.autotune.workloads import Workload
 from gmijax.clock import running_s
 from gmijax.config import Timeouts
 from gmijax.config.schema import to_dict
@@ -29,7 +29,6 @@ class ProfileLate(Exception):
 def profile(
     workload: Workload[Any],
     point: Point,
-    mode: Mode,
     machine: Machine,
     run: RunPaths,
     *,
@@ -44,7 +43,7 @@ def profile(
       JobInterrupted: a signal came.
     """
     try:
-        plan = workload.plan_at(point, mode, machine)
+        plan = workload.plan_at(point, machine)
         config = workload.config_at(point, plan.layout.num_gmis)
     except ConfigError as error:
         return NotRunnable(str(error))

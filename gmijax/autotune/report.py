@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,6 @@ from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
 from gmijax.autotune.search import Outcome, Visited
 from gmijax.autotune.workloads import Split
 from gmijax.supervise.watched_gmi import GmiStatus
-
-Results = Mapping[Point, Measured | NotRunnable]
 
 _LONGEST_REASON = 90
 
@@ -47,18 +45,18 @@ class SearchDisplay:
     def __exit__(self, *exc: Any) -> None:
         self._bar.stop()
 
-    def watch(self, what: str, gmis: Sequence[GmiStatus]) -> None:
+    def watch(self, point: Point, gmis: Sequence[GmiStatus]) -> None:
         """Shows how far the running profile is; called about 20 times a second."""
         slowest = min(gmis, key=lambda gmi: gmi.iteration)
         self._bar.update(
             self._task,
             completed=time.monotonic() - self._started_s,
-            description=f"{what}: GMI {slowest.gmi} {slowest.state}",
+            description=f"{point}: GMI {slowest.gmi} {slowest.state}",
         )
 
-    def done(self, what: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
+    def done(self, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
         """Prints what a profile found."""
-        self._console.print(f"{what}: {_found(point, result)} ({wall_s:.0f} s)")
+        self._console.print(f"{point}: {_found(point, result)} ({wall_s:.0f} s)")
 
 
 def verdict(outcome: Outcome, grid: Grid, num_gpus: int, split: Split | None = None) -> str:
@@ -88,8 +86,8 @@ def verdict(outcome: Outcome, grid: Grid, num_gpus: int, split: Split | None = N
     return said
 
 
-def table(outcome: Outcome, isolated: Results) -> Table:
-    """One row per point, best marked; with the isolated profile beside it where there is one."""
+def table(outcome: Outcome) -> Table:
+    """One row per point, best marked."""
     shown = Table(title="environment steps per second")
     for heading in ("GMIs", "envs", "MJX", "one GMI", "whole job", "MiB", "saturation"):
         shown.add_column(heading, justify="right", overflow="fold")
@@ -97,8 +95,6 @@ def table(outcome: Outcome, isolated: Results) -> Table:
     if has_trainers:
         for heading in ("could act, k", "could learn, k"):
             shown.add_column(heading, justify="right", overflow="fold")
-    if isolated:
-        shown.add_column("corun/isolated", justify="right")
     shown.add_column("choice")
     for one in sorted(outcome.visited, key=lambda one: one.point):
         point, result = one.point, one.result
@@ -114,25 +110,11 @@ def table(outcome: Outcome, isolated: Results) -> Table:
             if has_trainers:
                 rates = result.acting_per_s, result.learning_per_s
                 cells += [f"{rate / 1000:,.1f}" for rate in rates]
-        if isolated:
-            ratio = contention(result, isolated.get(point))
-            cells.append("" if ratio is None else f"{ratio:.2f}")
         shown.add_row(*cells, note, style="bold" if one == outcome.best else None)
     return shown
 
 
-def contention(
-    corun: Measured | NotRunnable, isolated: Measured | NotRunnable | None
-) -> float | None:
-    """Throughput of a GMI among others over that of one alone with its share; None if unknown."""
-    if isinstance(corun, Measured) and isinstance(isolated, Measured):
-        return corun.env_steps_per_s / isolated.env_steps_per_s
-    return None
-
-
-def plain_data(
-    outcome: Outcome, isolated: Results, reason: str, split: Split | None = None
-) -> dict[str, Any]:
+def plain_data(outcome: Outcome, reason: str, split: Split | None = None) -> dict[str, Any]:
     """The outcome for `search.json`."""
     best = outcome.best
     gpus = {} if split is None else {f"{what}_gpus": n for what, n in split._asdict().items()}
@@ -146,12 +128,8 @@ def plain_data(
                 **_what(one.point, one.result),
                 "saturation": _json_number(one.saturation),
                 "projected": one.projected,
-                "corun_over_isolated": contention(one.result, isolated.get(one.point)),
             }
             for one in outcome.visited
-        ],
-        "isolated": [
-            {**_where(point), **_what(point, result)} for point, result in isolated.items()
         ],
     }
 

@@ -3,8 +3,9 @@
 Pure rules over a `profile` function that measures one point; `gmijax.autotune.tuner` gives it
 one that runs training jobs, tests give it a formula. What the lines of the paper became:
 
-- 2, 4: every number of GMIs, 10 ... 1, with every num_env, 128 ... 16384. The same grid, and the
-  same order inside a row; which rows and sizes come first is for `Rules.coarse_first` to say.
+- 2, 4: every number of GMIs, 10 ... 1, with every num_env, 128 ... 16384. The same grid; first
+  every third row with the largest size and the third below it, then the neighbours of the best
+  point, until none of them is better.
 - 5: `profile` says whether a point runs, its throughput and memory. The same, and physics
   implementations are a further dimension.
 - 6-8: what cannot run is skipped. The same.
@@ -16,10 +17,10 @@ one that runs training jobs, tests give it a formula. What the lines of the pape
   point is a candidate: a gain below alpha is still one.
 - 20: `estimate`, which the paper does not print, is `estimate` below; `Rules.estimate` is another
   where GPUs act and train apart (`gmijax.autotune.async_workload`).
-- 21-24: the highest projection wins. Here the simplest does of those within `Rules.tolerance` of
-  it: with the fewest GMIs, then with the fewest environments.
+- 21-24: the highest projection wins. Here the simplest does of those within `TOLERANCE` of it:
+  with the fewest GMIs, then with the fewest environments.
 
-Where some GMIs act and others train, the numbers of both are dimensions of the grid.
+As it is printed it is in `gmijax.baselines.algorithm2`.
 """
 
 from __future__ import annotations
@@ -34,10 +35,15 @@ from gmijax.autotune.grid import (
     Measured,
     NotRunnable,
     Point,
-    as_printed,
     coarse,
     neighbours,
 )
+
+ALPHA: Final = 0.1
+"""A row ends when Sat falls below it: the paper has below 0.1."""
+
+TOLERANCE: Final = 0.02
+"""Relative difference of throughput that counts as none."""
 
 _CLEARLY_SLOWER: Final = 0.9
 """An implementation that makes less than this of another in the first row is left alone."""
@@ -57,12 +63,6 @@ class Rules(NamedTuple):
     # Environment steps a second of the whole job, line 20.
     estimate: Callable[[Point, Measured], float]
     top: Callable[[Measured], float]  # What Sat goes by.
-    alpha: float  # A row ends when Sat falls below it; the paper has below 0.1.
-    tolerance: float  # Relative difference of throughput that counts as none.
-    # First every third row with the largest size and the third below it, then the neighbours
-    # of the best point, until none of them is better; else the whole grid in the paper's
-    # order.
-    coarse_first: bool
 
 
 class Visited(NamedTuple):
@@ -109,27 +109,24 @@ def estimate(gmis_per_gpu: int, num_gpus: int, measured: Measured) -> float:
 
 
 def search(grid: Grid, profile: Profile, rules: Rules) -> Outcome:
-    """Looks for the point with the highest projected throughput; see `Rules.coarse_first`."""
+    """Looks for the point with the highest projected throughput."""
     book = _Book(profile, rules)
     complete = True
     try:
-        if rules.coarse_first:
-            _first_look(book, grid)
-            _climb(book, grid)
-        else:
-            _rows(book, as_printed(grid))
+        _first_look(book, grid)
+        _climb(book, grid)
     except OutOfBudget:
         complete = False
-    return Outcome(tuple(book.visited.values()), best(book.visited, rules.tolerance), complete)
+    return Outcome(tuple(book.visited.values()), best(book.visited), complete)
 
 
-def best(visited: Mapping[Point, Visited], tolerance: float) -> Visited | None:
-    """Lines 21 to 24: the simplest of the points that are within `tolerance` of the highest."""
+def best(visited: Mapping[Point, Visited]) -> Visited | None:
+    """Lines 21 to 24: the simplest of the points that are within `TOLERANCE` of the highest."""
     runnable = [one for one in visited.values() if isinstance(one.result, Measured)]
     if not runnable:
         return None
     highest = max(one.projected for one in runnable)
-    good = [one for one in runnable if one.projected >= highest * (1.0 - tolerance)]
+    good = [one for one in runnable if one.projected >= highest * (1.0 - TOLERANCE)]
 
     def simplest_first(one: Visited) -> tuple[float, ...]:
         point = one.point
@@ -160,7 +157,7 @@ class _Book:
 
     def is_saturated(self, one: Visited) -> bool:
         """Line 18."""
-        return one.saturation is not None and one.saturation < self.rules.alpha
+        return one.saturation is not None and one.saturation < ALPHA
 
     def has_ended(self, point: Point) -> bool:
         """Whether the point's row ended, by saturation, at a smaller size."""
@@ -168,7 +165,7 @@ class _Book:
 
     def best(self) -> Visited | None:
         """Lines 21 to 24, so far."""
-        return best(self.visited, self.rules.tolerance)
+        return best(self.visited)
 
     def _before(self, point: Point) -> Measured | None:
         """The last point of the row, before this one, that ran."""
@@ -188,9 +185,9 @@ class _Book:
 
 def _rows(book: _Book, grid: Grid) -> None:
     """Lines 2 to 26 over a grid, in its order."""
-    for impl, trainers, gmis_per_gpu in product(grid.impls, grid.trainers, grid.gmis_per_gpu):
+    for impl, gmis_per_gpu in product(grid.impls, grid.gmis_per_gpu):
         for num_envs in grid.num_envs:
-            if book.is_saturated(book.visit(Point(gmis_per_gpu, num_envs, impl, trainers))):
+            if book.is_saturated(book.visit(Point(gmis_per_gpu, num_envs, impl, grid.trainers))):
                 break
 
 
@@ -203,7 +200,7 @@ def _first_look(book: _Book, grid: Grid) -> None:
     sizes = grid.num_envs
     while sizes and book.best() is None:
         part = coarse(grid._replace(num_envs=sizes))
-        _rows(book, part._replace(gmis_per_gpu=part.gmis_per_gpu[:1], trainers=part.trainers[:1]))
+        _rows(book, part._replace(gmis_per_gpu=part.gmis_per_gpu[:1]))
         _rows(book, part._replace(impls=_worth_more(book, grid.impls)))
         sizes = tuple(size for size in sizes if size < part.num_envs[0])
 

@@ -1,7 +1,7 @@
-"""The profile store: what points of a search did, kept between searches. No jax here.
+"""The profile store: what profiles of searches and sweeps found, for the next. No jax here.
 
-One JSON file for a device, a task with its settings, and the versions of what computes. A search
-writes it after every profile: what was interrupted goes on from there, and a second search of the
+One JSON file for a device, a task with its settings, and the versions of what computes. It is
+written after every profile: what was interrupted goes on from there, and a second search of the
 same job measures nothing.
 """
 
@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import re
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import count
@@ -21,6 +22,7 @@ from typing import Any
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.config.schema import require_positive
 from gmijax.errors import ConfigError, GmijaxError
+from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import read_json, write_json
 
 _DIGEST_LENGTH = 10
@@ -33,12 +35,16 @@ class ProfileStore:
       path: the file; it is made with the first profile.
     """
 
-    def __init__(self, folder: Path, key: Mapping[str, Any], note: Callable[[str], None]) -> None:
+    def __init__(
+        self, named: str | None, key: Mapping[str, Any], note: Callable[[str], None]
+    ) -> None:
         """Reads what there is; raises ConfigError for a folder that cannot be used.
 
-        `key` is everything that decides what a point does; `device` and `task` name the file.
-        `note` gets a sentence where a broken file was moved aside.
+        `named` is its folder; None: `profiles` in the user's cache. `key` is everything that
+        decides what a point does; `device` and `task` name the file. `note` gets a sentence where
+        a broken file was moved aside.
         """
+        folder = Path(named) if named else cache_folder() / "profiles"
         self._key = dict(key)
         self._note = note
         digest = hashlib.sha256(json.dumps(self._key, sort_keys=True).encode()).hexdigest()
@@ -52,17 +58,40 @@ class ProfileStore:
             ) from None
         self._records = self._load()
 
-    def get(self, mode: str, point: Point) -> Measured | NotRunnable | None:
-        """Result of a point, None where it was not profiled yet."""
-        record = self._records.get(_name(mode, point))
-        return _result(record) if record else None
+    def kept_or(
+        self,
+        kind: str,
+        point: Point,
+        measure: Callable[[], Measured | NotRunnable],
+        limit_s: float,
+    ) -> Measured | NotRunnable:
+        """Result of a point: the kept one, else what is measured now, which is kept.
 
-    def put(self, mode: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
-        """Keeps what a point did, in the file too.
+        Args:
+          kind: what was profiled; others at the same point are others.
+          point: of the grid.
+          measure: profiles it; what it raises is not kept.
+          limit_s: time that a profile has. What did not end within less is measured again.
 
         Raises:
           GmijaxError: the file cannot be written, e.g. because the disk is full by now.
         """
+        known = self.get(kind, point)
+        late_s = known.limit_s if isinstance(known, NotRunnable) else None
+        if known is not None and not (late_s and late_s < limit_s):
+            return known
+        started_s = time.monotonic()
+        result = measure()
+        self.put(kind, point, result, time.monotonic() - started_s)
+        return result
+
+    def get(self, kind: str, point: Point) -> Measured | NotRunnable | None:
+        """Result of a point, None where it was not profiled yet."""
+        record = self._records.get(_name(kind, point))
+        return _result(record) if record else None
+
+    def put(self, kind: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
+        """Keeps what a point did, in the file too; raises as `kept_or`."""
         if isinstance(result, NotRunnable):
             said = {"not_runnable": result.reason, "limit_s": result.limit_s, "wall_s": wall_s}
         else:
@@ -71,7 +100,7 @@ class ProfileStore:
         try:
             with _locked(self.path.with_suffix(".lock")):
                 # What another search has found meanwhile stays.
-                self._records = {**self._records, **self._load(), _name(mode, point): record}
+                self._records = {**self._records, **self._load(), _name(kind, point): record}
                 write_json(self.path, {"key": self._key, "profiles": self._records})
         except OSError as error:
             raise GmijaxError(
@@ -114,8 +143,8 @@ def _moved_aside(path: Path) -> Path:
     return aside
 
 
-def _name(mode: str, point: Point) -> str:
-    return f"{mode} {point.gmis_key}x{point.num_envs} {point.impl}"
+def _name(kind: str, point: Point) -> str:
+    return f"{kind} {point.gmis_key}x{point.num_envs} {point.impl}"
 
 
 def _slug(text: object) -> str:

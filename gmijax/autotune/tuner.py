@@ -7,9 +7,10 @@ they meet the profile store, the time budget and the console.
 from __future__ import annotations
 
 import time
-from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 
@@ -18,11 +19,9 @@ from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
 from gmijax.autotune.profile import ProfileLate, profile
 from gmijax.autotune.report import SearchDisplay, draw, plain_data, table, verdict
 from gmijax.autotune.search import Outcome, OutOfBudget, Rules, Visited
-from gmijax.autotune.search import search as search_grid
 from gmijax.autotune.store import ProfileStore
 from gmijax.autotune.workloads import (
     C,
-    Mode,
     PpoWorkload,
     ServeWorkload,
     Split,
@@ -36,10 +35,14 @@ from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import candidates, require_num_gpus
 from gmijax.partition.layout import Layout
-from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import RunPaths, create_run, write_json
 from gmijax.runs.names import nearby
 from gmijax.sim.impl import choose_impl
+
+_ORDERS: Final = MappingProxyType(
+    {"coarse_first": "gmijax.autotune.search", "as_printed": "gmijax.baselines.algorithm2"}
+)
+"""Modules whose `search` goes through the grid, by `search.order`."""
 
 
 class SearchResult(NamedTuple):
@@ -116,16 +119,12 @@ class Search:
         self._machine = machine
         self._console = console
         self._grid = grid = _grid(workload, machine)
-        fewest = Point(
-            min(grid.gmis_per_gpu), min(grid.num_envs), grid.impls[0], min(grid.trainers)
-        )
-        workload.plan_at(fewest, "corun", machine)
-        named = self._settings.store
-        folder = Path(named) if named else cache_folder() / "profiles"
-        self._store = ProfileStore(folder, workload.store_key(machine), self._console.print)
+        fewest = Point(min(grid.gmis_per_gpu), min(grid.num_envs), grid.impls[0], grid.trainers)
+        workload.plan_at(fewest, machine)
+        key = workload.store_key(machine)
+        self._store = ProfileStore(self._settings.store, key, self._console.print)
         self._display = SearchDisplay(console, self._settings.budget_s)
         self._deadline_s = 0.0
-        self._isolated: dict[Point, Measured | NotRunnable] = {}
         self._num_profiled = 0
 
     def result(self) -> SearchResult:
@@ -146,7 +145,7 @@ class Search:
         split = workload.split(best.result)
         reason = verdict(outcome, self._grid, workload.plan.num_gpus, split)
         device, label = workload.device(self._machine), workload.config.env.label
-        report = plain_data(outcome, self._isolated, reason, split) | {
+        report = plain_data(outcome, reason, split) | {
             "env": label,
             "device": device,
             "num_gpus": workload.plan.num_gpus,
@@ -157,7 +156,7 @@ class Search:
             "store": str(self._store.path),
             "versions": installed_versions(),
         }
-        self._console.print(table(outcome, self._isolated))
+        self._console.print(table(outcome))
         self._console.print(reason)  # Before the files, for which there may be no room.
         if self.run is not None:
             write_json(self.run.search_report, report)
@@ -168,66 +167,49 @@ class Search:
         return SearchResult(run_dir, gmis_per_gpu, num_envs, impl, reason, report, trainers, split)
 
     def _outcome(self) -> Outcome:
-        settings = self._settings
-        mode: Mode = "isolated" if settings.mode == "isolated" else "corun"
-        rules = Rules(
-            estimate=self._workload.projected,
-            top=self._workload.top,
-            alpha=settings.alpha,
-            tolerance=settings.tolerance,
-            coarse_first=settings.order == "coarse_first",
-        )
-        outcome = search_grid(self._grid, lambda point: self._profile(point, mode), rules)
-        if settings.mode == "both":
-            with suppress(OutOfBudget):
-                for one in sorted(outcome.visited, key=lambda one: -one.projected):
-                    if isinstance(one.result, Measured) and one.point.gmis_per_gpu > 1:
-                        self._isolated[one.point] = self._profile(one.point, "isolated")
-        return outcome
+        rules = Rules(estimate=self._workload.projected, top=self._workload.top)
+        chosen = import_module(_ORDERS[self._settings.order])
+        return chosen.search(self._grid, self._profile, rules)
 
-    def _profile(self, point: Point, mode: Mode) -> Measured | NotRunnable:
+    def _profile(self, point: Point) -> Measured | NotRunnable:
         """Result of a point: from the store, else from a job of its own."""
-        what = f"{point} ({mode})"
         try:
-            self._workload.plan_at(point, mode, self._machine)
+            self._workload.plan_at(point, self._machine)
         except ConfigError as error:
             # Not kept: there may be more room, or another driver, next time.
             refused = NotRunnable(str(error))
-            self._display.done(what, point, refused, 0.0)
+            self._display.done(point, refused, 0.0)
             return refused
-        known = self._store.get(mode, point)
-        limit_s = known.limit_s if isinstance(known, NotRunnable) else None
-        # What was late before may have more time now.
-        if known is not None and not (limit_s and limit_s < self._settings.profile_timeout_s):
-            return known
+        limit_s = self._settings.profile_limit_s
+        return self._store.kept_or("search", point, lambda: self._measured(point), limit_s)
+
+    def _measured(self, point: Point) -> Measured | NotRunnable:
+        """Result of a job of its own."""
         started_s = time.monotonic()
-        result = self._measured(point, mode, what)
-        wall_s = time.monotonic() - started_s
+        result = self._run(point)
         self._num_profiled += 1
-        self._store.put(mode, point, result, wall_s)
-        self._display.done(what, point, result, wall_s)
+        self._display.done(point, result, time.monotonic() - started_s)
         return result
 
-    def _measured(self, point: Point, mode: Mode, what: str) -> Measured | NotRunnable:
+    def _run(self, point: Point) -> Measured | NotRunnable:
         left_s = self._deadline_s - running_s()
         if left_s <= 0:
             raise OutOfBudget
-        limit_s = min(left_s, self._settings.profile_timeout_s)
+        limit_s = min(left_s, self._settings.profile_limit_s)
         if self.run is None:
             self.run = create_run(None, None, f"{self._workload.config.env.slug}-search")
         try:
             return profile(
                 self._workload,
                 point,
-                mode,
                 self._machine,
-                self.run.search_profile(f"{mode}-{point.gmis_key}x{point.num_envs}-{point.impl}"),
+                self.run.search_profile(f"{point.gmis_key}x{point.num_envs}-{point.impl}"),
                 limit_s=limit_s,
-                on_tick=lambda gmis: self._display.watch(what, gmis),
+                on_tick=lambda gmis: self._display.watch(point, gmis),
                 on_warning=self._console.print,
             )
         except ProfileLate as late:
-            if limit_s < self._settings.profile_timeout_s:
+            if limit_s < self._settings.profile_limit_s:
                 # Cut off, which says nothing about the point.
                 raise OutOfBudget from None
             return NotRunnable(str(late), limit_s)

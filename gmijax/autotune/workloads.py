@@ -19,8 +19,8 @@ from gmijax.config import (
     TrainConfig,
 )
 from gmijax.config.schema import to_dict
+from gmijax.config.search import PROFILED_ITERATIONS
 from gmijax.machine.snapshot import Machine
-from gmijax.partition.layout import Layout
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths, read_json
@@ -29,9 +29,6 @@ from gmijax.runs.result import TrainResult
 from gmijax.supervise.job_kinds import JobKind, serving_kind, training_kind
 from gmijax.supervise.watched_gmi import GmiStatus
 from gmijax.version import __version__, versions_of
-
-Mode = Literal["corun", "isolated"]
-"""All GMIs of a GPU run at once, or one of them alone, with the share that it would have."""
 
 C = TypeVar("C", TrainConfig, ServeConfig)
 
@@ -54,14 +51,14 @@ class Workload(ABC, Generic[C]):
       plan: how the whole job is to be spread.
       reduce: how it is to reduce.
       template: what `plan.template=auto` means; no other can be profiled.
-      trainers: numbers of training GMIs per GPU to choose from; (0,): every GMI does everything.
+      trainers: training GMIs on every GPU that trains; 0: every GMI does everything.
 
     Raises:
       ConfigError: a template that cannot be profiled.
     """
 
     template: TemplateName
-    trainers: tuple[int, ...] = (0,)
+    trainers: int = 0
 
     def __init__(self, config: C, kind: JobKind, reduce: ReduceConfig) -> None:
         config.plan.require_template((self.template,), "a search (numbers that are auto)")
@@ -87,11 +84,8 @@ class Workload(ABC, Generic[C]):
     def key(self) -> Mapping[str, Any]:
         """What else decides how fast the job is, plain data."""
 
-    def plan_at(self, point: Point, mode: Mode, machine: Machine) -> Plan:
-        """The plan of a profile, on the first GPU of the job.
-
-        `isolated` is the first GMI of the plan that `corun` has, with its memory and cores; where
-        the backend can cap SMs, with an even part of them.
+    def plan_at(self, point: Point, machine: Machine) -> Plan:
+        """The plan of a profile, of all GMIs on the first GPU of the job.
 
         Raises:
           ConfigError: a point that the machine or the backend does not allow.
@@ -103,22 +97,7 @@ class Workload(ABC, Generic[C]):
             gmis_per_gpu=point.gmis_per_gpu,
             layout=None,
         )
-
-        def planned(config: PlanConfig) -> Plan:
-            return make_plan(config, self.reduce, point.num_envs, machine, template=self.template)
-
-        plan = planned(one_gpu)
-        if mode == "corun" or point.gmis_per_gpu == 1:
-            return plan
-        if plan.backend == "mps" and one_gpu.sm_percent is None:
-            plan = planned(dataclasses.replace(one_gpu, sm_percent="even"))
-        return dataclasses.replace(
-            plan,
-            layout=Layout(((0,),)),
-            slices=plan.slices[:1],
-            roles=plan.roles[:1],
-            strategy="none",
-        )
+        return make_plan(one_gpu, self.reduce, point.num_envs, machine, template=self.template)
 
     def enough(self, plan: Plan, run: RunPaths) -> Callable[[Sequence[GmiStatus]], bool] | None:
         """What says when a profile can be read; None: it ends by itself."""
@@ -197,8 +176,8 @@ class PpoWorkload(Workload[TrainConfig]):
     @property
     def key(self) -> Mapping[str, Any]:
         """See `Workload`."""
-        algo, iterations = to_dict(self.config.algo), self.config.search.iterations
-        return {"job": "train", "algo": algo, "iterations": iterations}
+        algo = to_dict(self.config.algo)
+        return {"job": "train", "algo": algo, "iterations": PROFILED_ITERATIONS}
 
     def config_at(self, point: Point, num_gmis: int) -> TrainConfig:
         """See `Workload`."""
@@ -208,7 +187,7 @@ class PpoWorkload(Workload[TrainConfig]):
             config.run, resume=None, checkpoint_every=0, measure_throughput=False, profile=None
         )
         no_eval = dataclasses.replace(config.eval, every=None, video=False)
-        steps = config.search.iterations * steps
+        steps *= PROFILED_ITERATIONS
         return self.with_point(point, num_timesteps=steps, run=run, eval=no_eval)
 
     def read(self, plan: Plan, run: RunPaths) -> Measured:
@@ -246,7 +225,7 @@ class ServeWorkload(Workload[ServeConfig]):
             "policy": config.policy,
             "run": config.run.dir,
             "unroll_length": config.unroll_length,
-            "iterations": config.search.iterations,
+            "iterations": PROFILED_ITERATIONS,
         }
 
     def config_at(self, point: Point, num_gmis: int) -> ServeConfig:
@@ -255,7 +234,7 @@ class ServeWorkload(Workload[ServeConfig]):
         steps = point.num_envs * config.unroll_length * num_gmis
         return self.with_point(
             point,
-            num_timesteps=config.search.iterations * steps,
+            num_timesteps=PROFILED_ITERATIONS * steps,
             output=dataclasses.replace(config.output, dir=None),
             latency_steps=0,
         )

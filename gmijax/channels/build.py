@@ -113,8 +113,7 @@ def open_sender(
     most = max_piece_bytes(config.capacity_bytes)
     packer: Packer = UniPacker(migrator)
     if config.design == "multi":
-        fixed = None if config.transfer_kib is None else config.transfer_kib * 1024
-        packer = Compressor(migrator, TransferSize(fixed, most), most)
+        packer = Compressor(migrator, TransferSize(most), most)
     return Sender(Dispenser(rank, most), packer, migrator, on_device=False, held=held)
 
 

@@ -33,15 +33,15 @@ WORTH_IT = 0.95
 
 
 class TransferSize:
-    """Doubles `num_bytes` as long as a byte gets cheaper, then keeps the best; or keeps to a size.
+    """Doubles `num_bytes` as long as a byte gets cheaper, then keeps the best.
 
     The price of a transfer is fixed plus so much a byte, so that there is no use in going on
     once it has stopped falling; larger transfers only make experience older.
     """
 
-    def __init__(self, fixed_bytes: int | None, max_bytes: int) -> None:
-        self.num_bytes = min(fixed_bytes or START_BYTES, max_bytes)
-        self.is_tuned = fixed_bytes is not None
+    def __init__(self, max_bytes: int) -> None:
+        self.num_bytes = min(START_BYTES, max_bytes)
+        self.is_tuned = False
         self._max_bytes = max_bytes
         self._samples: list[float] = []
         self._best: tuple[float, int] | None = None

@@ -18,6 +18,7 @@ from gmijax.cli.arguments import parse, readable, require_text
 from gmijax.cli.groups import choices, config_dir
 from gmijax.cli.saved import as_the_run_was, copy_key, with_saved
 from gmijax.config import EnvConfig, ServeConfig, TrainConfig
+from gmijax.config.removed import require_not_removed
 from gmijax.config.schema import flatten, from_dict, known, require_between, suggestion
 from gmijax.errors import ConfigError
 from gmijax.runs.saved_config import require_known_keys, saved_config_of
@@ -171,6 +172,7 @@ def _check_override(name: str, item: Override) -> None:
     key = item.key_or_group
     if not key:
         raise ConfigError(f"{item.input_line}: expected key=value")
+    require_not_removed(key)
     # Hydra's own settings are for jobs that hydra runs; here they would do nothing.
     if re.split(r"[./]", key)[0] == "hydra":
         raise _unknown_key(key, defaults(name, ()))

@@ -1,10 +1,4 @@
-"""Who acts while experience is collected, and the compiled parts: an unroll, halves of a step.
-
-Where simulator and agent share a GMI, T steps are one program. Where they do not, a step is cut
-where data leaves the GMI: `simulate` ends with what the agent must know, `infer` is the agent's.
-Both draw the policy's noise from the environments' own keys, so that they collect the same
-experience.
-"""
+"""Who acts while experience is collected, and the compiled part: an unroll of T steps."""
 
 from __future__ import annotations
 
@@ -154,40 +148,3 @@ def unroll(
 
     state, (steps, rewards, outcomes) = run_steps(env, choose, length, kept, model, state)
     return state, steps, count(rewards, outcomes)
-
-
-def simulate(
-    env: BatchedEnv,
-    keep: Keep,
-    model: PyTree,
-    state: BatchState,
-    counts: Counts,
-    action: Array,
-    log_prob: Array,
-) -> tuple[BatchState, Array, Counts, Step | None]:
-    """The simulator's half of a step: physics, then keys for the next action.
-
-    The keys of `state` are those of this step (`next_keys`); actions [N, A] and log densities [N]
-    are the agent's.
-
-    Returns:
-      The state, random bits [N, ...] uint32 for the agent's next draw, the counts with those of
-      this step, and the step.
-    """
-    after, out = env.step(model, state, action)
-    one = jax.tree.map(lambda x: x[None], (out.reward, outcome_of(out)))
-    counts = jax.tree.map(jnp.add, counts, count(*one))
-    step = keep.of(state, log_prob, action, out)
-    after, bits = next_keys(after)
-    return after, bits, counts, step
-
-
-def next_keys(state: BatchState) -> tuple[BatchState, Array]:
-    """Draws a key per environment for the agent, as bits [N, ...] that can be sent."""
-    state, keys = split_keys(state)
-    return state, jax.random.key_data(keys)
-
-
-def infer(policy: ActingPolicy, weights: PyTree, obs: Array, bits: Array) -> tuple[Array, Array]:
-    """The agent's half of a step: actions [N, A] and log densities [N]."""
-    return policy.choose(weights, obs, jax.random.wrap_key_data(bits))

@@ -28,16 +28,13 @@ class ShardWriter:
     `num_written` of them, of `num_bytes` in all, are finished and safe.
     """
 
-    def __init__(
-        self, paths: DataPaths, rank: int, first: int, about: Mapping[str, Any], *, compress: bool
-    ) -> None:
+    def __init__(self, paths: DataPaths, rank: int, first: int, about: Mapping[str, Any]) -> None:
         """Begins at shard `first`; `about` goes into the JSON file of every shard."""
         self.num_written = self.num_bytes = 0
         self._paths = paths
         self._rank = rank
         self._first = self._next = first
         self._about = dict(about)
-        self._save: Callable[..., None] = np.savez_compressed if compress else np.savez
         self._pool = ThreadPoolExecutor(1, "shards")
         self._pending: Future[int] | None = None
         paths.folder(rank).mkdir(exist_ok=True)
@@ -70,7 +67,8 @@ class ShardWriter:
         }
         shard = self._paths.shard(self._rank, index)
         content = io.BytesIO()
-        self._save(content, **arrays)
+        save: Callable[..., None] = np.savez  # For pyright, an array may be called `allow_pickle`.
+        save(content, **arrays)
         # On the disk before its JSON file is, which says that the shard is there.
         write_bytes(shard.arrays, content.getvalue())
         write_json(

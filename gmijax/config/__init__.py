@@ -20,7 +20,6 @@ from gmijax.config.env import PhysicsConfig as PhysicsConfig
 from gmijax.config.evaluation import EvalConfig as EvalConfig
 from gmijax.config.plan import BackendName as BackendName
 from gmijax.config.plan import PlanConfig as PlanConfig
-from gmijax.config.plan import Priority as Priority
 from gmijax.config.plan import ReduceConfig as ReduceConfig
 from gmijax.config.plan import StrategyName as StrategyName
 from gmijax.config.plan import TemplateName as TemplateName

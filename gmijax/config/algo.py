@@ -199,7 +199,8 @@ class PpoConfig(ActorCriticConfig):
     implementation = "gmijax.ppo.ppo:PPO"
     templates = ("tcg_ex", "tdg_ex")
 
-    name: Literal["ppo"] = doc("training algorithm")
+    # algo= sets it.
+    name: Literal["ppo"] = "ppo"
     clipping_epsilon: float = doc("clip range of the probability ratio", positive=True)
     clip_value_loss: bool = doc("clip the value loss with clipping_epsilon too")
     recompute_advantages: bool = doc(
@@ -248,7 +249,8 @@ class A3cConfig(ActorCriticConfig):
 
     templates = ("decoupled",)
 
-    name: Literal["a3c"] = doc("training algorithm")
+    # algo= sets it.
+    name: Literal["a3c"] = "a3c"
     weights_every: int | None = doc(
         "environment steps after which, at the latest, an agent takes up newer weights, within an "
         "unroll too; null: with every unroll",
@@ -319,7 +321,8 @@ class DistillConfig(RolloutConfig):
 
     implementation = "gmijax.distill.distill:DISTILL"
 
-    name: Literal["distill"] = doc("training algorithm")
+    # algo= sets it.
+    name: Literal["distill"] = "distill"
     teacher: str | None = doc(
         "run folder or checkpoint of the policy that the student learns from, trained on a task "
         "with the same observations and actions; last: the newest run"
@@ -345,7 +348,8 @@ class SacConfig(PolicyConfig):
 
     implementation = "gmijax.sac.sac:SAC"
 
-    name: Literal["sac"] = doc("training algorithm")
+    # algo= sets it.
+    name: Literal["sac"] = "sac"
     discounting: float = doc("discount factor per step, 0 to 1", low=0.0, high=1.0)
     reward_scaling: float = doc(
         "factor on rewards before learning (logged returns are unscaled)", positive=True

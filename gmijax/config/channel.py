@@ -29,19 +29,9 @@ class ChannelConfig(KeyGroup):
         default=64,
         low=1,
     )
-    transfer_kib: int | None = doc(
-        "experience that travels at once, KiB, one rollout at least; null: found by trying",
-        default=None,
-        low=1,
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.transfer_kib is not None and self.transfer_kib * 4 > self.capacity_mib * 1024:
-            raise ConfigError(
-                f"channel.transfer_kib={self.transfer_kib}: must be at most a quarter of "
-                f"channel.capacity_mib={self.capacity_mib}"
-            )
         if self.transport == "device" and (why := self.why_not_device()):
             raise ConfigError(f"channel.transport=device: {why}")
 

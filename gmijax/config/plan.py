@@ -12,7 +12,6 @@ from gmijax.errors import ConfigError
 BackendName = Literal["mps", "mig", "share", "cpu"]
 StrategyName = Literal["mpr", "mrr", "har", "flat", "one_shot"]
 TemplateName = Literal["tcg", "tdg", "tcg_ex", "tdg_ex", "decoupled"]
-Priority = Literal["normal", "below_normal"]
 
 MAX_GMIS = 1024
 """More processes than one host can run; making a plan of far more would take all its memory."""
@@ -62,15 +61,6 @@ class PlanConfig(KeyGroup):
         high=1.0,
     )
     template: Literal["auto", TemplateName] = doc("how roles map to GMIs", default="auto")
-    mps_priority: Literal["trainers_first"] | tuple[Priority, ...] | None = doc(
-        "whose kernels go first where several wait for a GPU (MPS): trainers_first, or one of "
-        "normal, below_normal for each GMI; null: all alike",
-        default=None,
-    )
-    force_sm_percent: bool = doc(
-        "take an sm_percent at which wrong matrix products were reported (docs/shares.md)",
-        default=False,
-    )
     self_check: Literal["auto", "on", "off"] = doc(
         "compare matrix products with float64 when a GMI starts; auto: where SMs are capped, or "
         "an MPS daemon of somebody else may cap them",
@@ -116,11 +106,6 @@ class PlanConfig(KeyGroup):
             return len(self.layout)
         return self.gpus if isinstance(self.gpus, int) else len(self.gpus)
 
-    @property
-    def needs_mps(self) -> bool:
-        """Whether something is wanted that only MPS has."""
-        return self.sm_percent is not None or self.mps_priority is not None
-
     def require_template(self, allowed: Iterable[TemplateName], why: str) -> None:
         """Raises ConfigError unless `template` is `auto` or one of those `allowed`."""
         names = ("auto", *allowed)
@@ -136,32 +121,11 @@ class ReduceConfig(KeyGroup):
 
     prefix = "reduce."
 
-    strategy: Literal["auto", StrategyName] = doc(
-        "reduction strategy; auto: by the layout, see selection", default="auto"
-    )
-    intra: Literal["auto", "host", "ipc"] = doc(
-        "exchange inside one GPU, for har: through host memory, or through GPU memory that GMIs "
-        "map (ipc); auto: ipc where it can be had; host leaves out one_shot",
+    strategy: Literal["auto", "paper", StrategyName] = doc(
+        "reduction strategy; auto: by the layout, one_shot where several GMIs share a GPU and can "
+        "map its memory; paper: by the layout alone, the paper's Algorithm 1",
         default="auto",
     )
     timeout_s: float = doc(
         "longest wait for another GMI in one exchange, seconds", default=120.0, positive=True
     )
-    selection: Literal["paper", "device", "measured"] = doc(
-        "what strategy=auto goes by: the paper's Algorithm 1 (paper), the same but one_shot where "
-        "several GMIs share a GPU and can map its memory (device), or the time that every "
-        "strategy takes here, measured before the job starts and kept for the next one (measured)",
-        default="device",
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.strategy == "one_shot" and self.intra == "host":
-            raise ConfigError(
-                "reduce.intra=host: reduce.strategy=one_shot goes through memory of the GPUs; "
-                "allowed are auto, ipc"
-            )
-        if self.selection == "measured" and self.strategy != "auto":
-            raise ConfigError(
-                f"reduce.selection=measured: needs reduce.strategy=auto, not {self.strategy}"
-            )

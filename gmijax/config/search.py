@@ -11,6 +11,9 @@ from gmijax.errors import ConfigError
 AUTO = "auto"
 """The value of `num_envs` and `plan.gmis_per_gpu` that the search is to find."""
 
+PROFILED_ITERATIONS = 6
+"""Of one profile, the first is not counted; with algo=a3c batches that are counted, at least."""
+
 SHORTEST_BUDGET_S = 10.0
 """No GMI starts, compiles and trains in less."""
 
@@ -21,44 +24,28 @@ class SearchConfig(KeyGroup):
 
     prefix = "search."
 
-    gmis_per_gpu: tuple[int, ...] = doc("numbers of GMIs per GPU to choose from", low=1)
-    training_gmis_per_gpu: tuple[int, ...] = doc(
-        "with algo=a3c: numbers of training GMIs to choose from, on every GPU that trains; "
-        "gmis_per_gpu are those that act",
-        default=(1,),
-        low=1,
+    gmis_per_gpu: tuple[int, ...] = doc(
+        "numbers of GMIs per GPU to choose from; with algo=a3c of those that act", low=1
     )
     num_envs: tuple[int, ...] = doc("environments per GMI to choose from", low=1)
     impls: tuple[str, ...] = doc(
         "MJX implementations to choose from, e.g. [jax,warp]; []: the one of physics.impl"
     )
-    mode: Literal["corun", "isolated", "both"] = doc(
-        "profile all GMIs of a GPU at once, or one alone with its share (as the paper prints); "
-        "both: choose by corun, then profile the same points isolated and report the ratio"
-    )
     order: Literal["coarse_first", "as_printed"] = doc(
         "every third row with the largest size and the third below it, then the neighbours of the "
-        "best point; or the whole grid in the order of the paper's Algorithm 2"
+        "best point; or the paper's Algorithm 2 as it is printed, over the whole grid"
     )
-    alpha: float = doc(
-        "a row of sizes ends when gain of throughput / growth of memory is below this",
-        low=0.0,
+    budget_s: float = doc(
+        "seconds for the whole search; the best point so far is the answer; a profile that takes "
+        "longer than half of it is not runnable"
     )
-    tolerance: float = doc("relative difference of throughput that is ignored", low=0.0, high=0.5)
-    iterations: int = doc(
-        "training iterations of one profile, the first is not counted; with algo=a3c batches that "
-        "are counted, at least",
-        low=2,
-    )
-    budget_s: float = doc("seconds for the whole search; the best point so far is the answer")
-    profile_timeout_s: float = doc("a profile that takes longer is not runnable, seconds", low=1.0)
     store: str | None = doc(
         "folder of the profiles of earlier searches; null: gmijax/profiles in the user's cache"
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for key in ("gmis_per_gpu", "training_gmis_per_gpu", "num_envs"):
+        for key in ("gmis_per_gpu", "num_envs"):
             values = getattr(self, key)
             if not values or len(set(values)) != len(values):
                 raise ConfigError(f"search.{key}={list(values)}: expected distinct numbers")
@@ -71,3 +58,8 @@ class SearchConfig(KeyGroup):
                 f"search.budget_s={self.budget_s:g}: too small for one profile; must be at least "
                 f"{SHORTEST_BUDGET_S:g}"
             )
+
+    @property
+    def profile_limit_s(self) -> float:
+        """Seconds after which a profile is ended, and its point is not runnable."""
+        return self.budget_s / 2

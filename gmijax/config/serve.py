@@ -14,6 +14,7 @@ from gmijax.errors import ConfigError
 
 _MIN_PIPE_BYTES = 1 << 20
 _PIPE_BYTES_PER_ENV = 8192
+_EXCHANGE_TIMEOUT_S = 120.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,9 +28,11 @@ class ServeRunConfig(Timeouts):
     name: str | None = doc(
         "name of the job's own folder below runs/; null: <env>-serve-<date>-<time>"
     )
-    exchange_timeout_s: float = doc(
-        "longest wait for another GMI in one exchange, seconds", positive=True
-    )
+
+    @property
+    def exchange_timeout_s(self) -> float:
+        """The longest wait for another GMI in one exchange, seconds."""
+        return min(_EXCHANGE_TIMEOUT_S, self.stall_timeout_s)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +41,6 @@ class OutputConfig:
 
     dir: str | None = doc("folder for the experience, made or continued; null: nothing is written")
     next_obs: bool = doc("write the observation before any reset too, to bootstrap from it")
-    compress: bool = doc("compress the shards (slower by far, smaller by little)")
 
 
 @dataclass(frozen=True, kw_only=True)

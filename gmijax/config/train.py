@@ -46,11 +46,6 @@ class TrainConfig(KeyGroup):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.plan.require_template(self.algo.templates, f"gmijax.train with algo={self.algo.name}")
-        if self.plan.template == "tdg_ex" and self.reduce.selection == "measured":
-            raise ConfigError(
-                "reduce.selection=measured: for jobs in which every GMI trains; with "
-                "plan.template=tdg_ex allowed are paper, device"
-            )
         if self.eval.every is not None and self.is_decoupled:
             raise ConfigError(
                 f"eval.every={self.eval.every}: with algo={self.algo.name} agents act all the "
@@ -74,15 +69,11 @@ class TrainConfig(KeyGroup):
         return self.num_envs
 
     def _check_on_nodes(self) -> None:
-        for key, value, allowed in (
-            ("plan.template", self.plan.template, ("auto", "tcg_ex", "decoupled")),
-            ("reduce.selection", self.reduce.selection, ("paper", "device")),
-        ):
-            if value not in allowed:
-                raise ConfigError(
-                    f"{key}={value}: not with cluster.engine={self.cluster.engine} yet; allowed "
-                    f"are {', '.join(allowed)}"
-                )
+        if self.plan.template not in (allowed := ("auto", "tcg_ex", "decoupled")):
+            raise ConfigError(
+                f"plan.template={self.plan.template}: not with "
+                f"cluster.engine={self.cluster.engine} yet; allowed are {', '.join(allowed)}"
+            )
         for key, value in (
             ("num_envs", self.num_envs),
             ("plan.gmis_per_gpu", self.plan.gmis_per_gpu),

@@ -10,7 +10,6 @@ from rich.console import Console
 
 from gmijax.autotune.tuner import with_auto_decided
 from gmijax.config import ReduceConfig, ServeConfig, TrainConfig
-from gmijax.control.strategy_selection import estimated_floats, with_measured
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
@@ -60,9 +59,6 @@ def decide(config: C, console: Console, nodes: Mapping[str, Machine] | None = No
         plan = make_plan(config.plan, nothing, num_envs, machine, template="tcg")
     else:
         plan = training_plan(config, machine, nodes=nodes)
-        if config.reduce.selection == "measured":
-            num_floats = estimated_floats(*config.algo.hidden_layer_sizes)
-            plan = with_measured(plan, machine, num_floats, config.reduce.intra)
     platform = "cpu" if plan.backend == "cpu" else "gpu"
     impl, why = choose_impl(config.physics.impl, platform, config.env.label)
     config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, impl=impl))

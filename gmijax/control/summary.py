@@ -50,7 +50,6 @@ def train_summary(
             **_of_plan(plan),
             "strategy": (result and result.strategy) or plan.strategy,
             "intra": (result and result.intra) or plan.intra,
-            "selection": dict(plan.selection),
         },
         "env_steps": env_steps,
         "wall_s": wall_s,

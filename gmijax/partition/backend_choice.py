@@ -43,7 +43,7 @@ def choose_backend(
     most = max(len(gmis) for gmis in layout.gmis_of_gpu)
     if why_mig := _why_mig(plan, layout, machine, serves):
         return "mig", why_mig
-    if most == 1 and not plan.needs_mps:
+    if most == 1 and plan.sm_percent is None:
         return "share", "one GMI on every GPU has nothing to share, and MPS would only add risk"
     oldest = min(gpu.compute_capability for gpu in candidates(plan, machine))
     if oldest[0] < _VOLTA:
@@ -59,8 +59,8 @@ def choose_backend(
     why = f"up to {most} GMIs on a GPU run at the same time with {daemon}"
     if oldest[0] < _AMPERE:
         return "mps", f"{why}; compute capability {_version(oldest)} has no MIG"
-    if serves and plan.needs_mps:
-        return "mps", f"{why}; only MPS can cap SMs, and has priorities"
+    if serves and plan.sm_percent is not None:
+        return "mps", f"{why}; only MPS can cap SMs"
     if serves:
         return "mps", f"{why}; there are no MIG instances to keep them apart"
     return "mps", f"{why}, and can exchange gradients"
@@ -156,7 +156,7 @@ def _why_mig(plan: PlanConfig, layout: Layout, machine: Machine, serves: bool) -
     """Why instances are taken; None if too few GPUs have any, or whole ones are better."""
     usable = candidates(plan, machine)
     divided = [gpu for gpu in usable if gpu.instances]
-    if len(divided) < layout.num_gpus or plan.needs_mps:
+    if len(divided) < layout.num_gpus or plan.sm_percent is not None:
         return None
     if sum(not gpu.mig_enabled for gpu in usable) < layout.num_gpus:
         why = "the GPUs here are in MIG mode"

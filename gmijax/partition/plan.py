@@ -7,10 +7,10 @@ A plan is made by `gmijax.partition.planner` from the configuration and the mach
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from gmijax.config import BackendName, Priority, TemplateName
+from gmijax.config import BackendName, TemplateName
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
 
@@ -29,7 +29,6 @@ class Slice:
       sm_percent: cap on SMs in percent, None for no cap.
       memory_fraction: fraction of the device's memory, None where memory is not partitioned.
       cpus: CPU cores that the process is pinned to; empty for no pinning.
-      priority: of its kernels among those of the GPU's other GMIs (MPS), None where all are alike.
     """
 
     gmi: int
@@ -38,7 +37,6 @@ class Slice:
     sm_percent: float | None
     memory_fraction: float | None
     cpus: tuple[int, ...]
-    priority: Priority | None = None
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,6 @@ class Plan:
       reasons: what was decided for an `auto`, and why, one sentence each.
       self_check: every GMI compares matrix products with float64 when it starts.
       may_share: where the daemons of `mps` cannot be started, the GMIs may take turns instead.
-      selection: with `reduce.selection=measured` what the paper says and what was measured.
       nodes: addresses of the nodes of the layout, in order; none in a job on one machine.
 
     Raises:
@@ -76,7 +73,6 @@ class Plan:
     reasons: tuple[str, ...] = ()
     self_check: bool = False
     may_share: bool = False
-    selection: Mapping[str, Any] = field(default_factory=dict)
     nodes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -123,13 +119,19 @@ class Plan:
 
     @classmethod
     def _from_dict(cls, data: Mapping[str, Any]) -> Plan:
-        fields = dict(data)
+        fields = _without(data, "selection")
         nodes = tuple(node["address"] for node in data.get("nodes", ()))
         rows = tuple(tuple(gmis) for gmis in data["layout"])
         fields["nodes"], fields["layout"] = nodes, Layout(rows, max(1, len(nodes)))
         fields["slices"] = tuple(
-            Slice(**{**item, "cpus": tuple(item["cpus"])}) for item in data["slices"]
+            Slice(**{**_without(item, "priority"), "cpus": tuple(item["cpus"])})
+            for item in data["slices"]
         )
         fields["reasons"] = tuple(data["reasons"])
         fields["roles"] = tuple(data["roles"])
         return cls(**fields)
+
+
+def _without(data: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """Plain data without a key that plans of older versions have."""
+    return {name: value for name, value in data.items() if name != key}

@@ -68,7 +68,7 @@ def make_plan(
     of_nodes = node_layouts(layout, machine, nodes)
     backend = _backend(plan, of_nodes, chosen in ("tcg", "tdg"), reasons)
     roles = roles_of(chosen, layout, trainers)
-    slices, gpus = _slices(plan, of_nodes, backend, roles, reasons)
+    slices, gpus = _slices(plan, of_nodes, backend, reasons)
     if plan.template == "auto":
         reasons.append(f"template {chosen}: {DESCRIPTIONS[chosen]}")
     strategy, intra = _reduction(reduce, layout, roles, backend, reasons)
@@ -109,7 +109,6 @@ def _slices(
     plan: PlanConfig,
     of_nodes: Sequence[NodeLayout],
     backend: BackendName,
-    roles: Sequence[str],
     reasons: list[str],
 ) -> tuple[tuple[Slice, ...], tuple[Gpu, ...]]:
     """The share of every GMI of its machine, in order of id, and the GPUs of the job."""
@@ -125,8 +124,7 @@ def _slices(
                 require_host(here.num_gmis, what, plan, node.machine)
             if backend != "cpu":
                 gpus = choose_gpus(plan, here, node.machine, backend, said)
-            theirs = [roles[gmi] for gmi in node.gmis]
-            shares = make_slices(plan, here, gpus, backend, node.machine, theirs, said)
+            shares = make_slices(plan, here, gpus, backend, node.machine, said)
         for share in shares:
             gmi, gpu = node.gmis[share.gmi], share.gpu + num_gpus
             slices[gmi] = dataclasses.replace(share, gmi=gmi, gpu=gpu)
@@ -186,7 +184,7 @@ def _self_check(
 
 
 def _may_share(plan: PlanConfig, gpus: Sequence[Gpu], backend: BackendName) -> bool:
-    takes_turns_else = plan.backend == "auto" and backend == "mps" and not plan.needs_mps
+    takes_turns_else = plan.backend == "auto" and backend == "mps" and plan.sm_percent is None
     return takes_turns_else and all(gpu.compute_mode == "default" for gpu in gpus)
 
 
@@ -210,19 +208,20 @@ def _reduction(
             "that train must have as many of them on as many GPUs, numbered in order of the nodes"
         )
     strategy = _strategy(reduce, training.layout, backend, reasons)
-    return strategy, _intra(reduce, strategy, layout, backend, reasons)
+    return strategy, _intra(strategy, backend, reasons)
 
 
 def _strategy(
     reduce: ReduceConfig, layout: Layout, backend: BackendName, reasons: list[str]
 ) -> str:
     """How those that train, in `layout`, average gradients; `none` if there is only one."""
-    if reduce.strategy != "auto":
+    is_named = reduce.strategy not in ("auto", "paper")
+    if is_named:
         require_strategy(reduce.strategy, layout, backend)
     if layout.num_gmis == 1:
         reasons.append("strategy none: no gradient reduction (one GMI)")
         return "none"
-    if reduce.strategy != "auto":
+    if is_named:
         return reduce.strategy
     paper, why = select_strategy(layout)
     no_ring = why_not_under(paper, layout, backend)
@@ -232,11 +231,11 @@ def _strategy(
     # With one GMI on each GPU one ring over all is as fast.
     wants_one_shot = no_ring is not None or not is_one_per_gpu(layout)
     wants_one_shot &= layout.of_node(0).num_gmis > 1
-    wants_one_shot &= reduce.selection == "device" and reduce.intra != "host"
+    wants_one_shot &= reduce.strategy == "auto"
     if wants_one_shot and no_one_shot is None:
         reasons.append(
             "strategy one_shot: GMIs that share GPUs train faster with exchanges on them; "
-            f"Algorithm 1 says {paper} ({why}), as reduce.selection=paper does"
+            f"Algorithm 1 says {paper} ({why}), as reduce.strategy=paper does"
         )
         return "one_shot"
     # Under other backends there is no memory of a GPU to share, whatever is installed.
@@ -249,15 +248,7 @@ def _strategy(
     return paper
 
 
-def _intra(
-    reduce: ReduceConfig, strategy: str, layout: Layout, backend: BackendName, reasons: list[str]
-) -> str:
-    if reduce.intra != "auto":
-        if reason := why_not_intra(reduce.intra, backend):
-            raise ConfigError(
-                f"reduce.intra={reduce.intra}: cannot run on layout {layout}: {reason}; use host"
-            )
-        return reduce.intra
+def _intra(strategy: str, backend: BackendName, reasons: list[str]) -> str:
     if reason := why_not_intra("ipc", backend):
         if strategy != "none":
             reasons.append(

@@ -204,7 +204,7 @@ class Strategy(NamedTuple):
     Attributes:
       why_not: None if it can run on a layout, else the reason in words.
       has_ring: whether it forms rings of NCCL between GPUs.
-      ways: how GMIs of one GPU may exchange (`reduce.intra`); `host` for those that do not care.
+      ways: how GMIs of one GPU may exchange; `host` for those that do not care.
     """
 
     why_not: Callable[[Layout], str | None]

@@ -11,13 +11,12 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from gmijax.config import BackendName, PlanConfig, Priority
+from gmijax.config import BackendName, PlanConfig
 from gmijax.errors import ConfigError
 from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.layout import Layout
 from gmijax.partition.plan import Slice
-from gmijax.partition.templates import TRAINER, has_role
 
 DEFAULT_MEMORY_FRACTION: Final = 0.8
 """Part of a GPU's (or MIG instance's) memory that its GMIs reserve together."""
@@ -36,7 +35,6 @@ def make_slices(
     gpus: Sequence[Gpu],
     backend: BackendName,
     machine: Machine,
-    roles: Sequence[str],
     reasons: list[str],
 ) -> tuple[Slice, ...]:
     """The share of every GMI, in order of id; `gpus` are those of the job, none on `cpu`.
@@ -46,7 +44,6 @@ def make_slices(
         each GMI; more GMIs on a GPU than MPS has room for.
     """
     caps = _sm_percents(plan, layout, gpus, backend, reasons)
-    priorities = _priorities(plan, layout, backend, roles)
     if backend == "cpu":
         if plan.memory_fraction is not None:
             reasons.append("plan.memory_fraction is not used on the cpu backend")
@@ -63,7 +60,7 @@ def make_slices(
     if backend in ("mps", "mig"):
         _require_room_for_clients(homes, machine)
     return tuple(
-        Slice(gmi, layout.gpu_of(gmi), home.device, caps[gmi], memory[gmi], (), priorities[gmi])
+        Slice(gmi, layout.gpu_of(gmi), home.device, caps[gmi], memory[gmi], ())
         for gmi, home in enumerate(homes)
     )
 
@@ -120,31 +117,8 @@ def _sm_percents(
         return caps
     caps = _one_each("plan.sm_percent", wanted, layout)
     for gmi, cap in enumerate(caps):
-        _check_cap(cap, gpus[layout.gpu_of(gmi)], plan.force_sm_percent, reasons)
+        _check_cap(cap, gpus[layout.gpu_of(gmi)])
     return caps
-
-
-def _priorities(
-    plan: PlanConfig, layout: Layout, backend: BackendName, roles: Sequence[str]
-) -> tuple[Priority | None, ...]:
-    """The priority of every GMI's kernels; None where all are alike."""
-    wanted = plan.mps_priority
-    if wanted is None:
-        return (None,) * layout.num_gmis
-    what = f"plan.mps_priority={_shown(wanted)}"
-    if backend != "mps":
-        raise ConfigError(f"{what}: only the mps backend has it, the backend is {backend}")
-    if wanted != "trainers_first":
-        if len(wanted) != layout.num_gmis:
-            raise ConfigError(f"{what}: {len(wanted)} values for {layout.num_gmis} GMIs")
-        return wanted
-    trains = [has_role(own, TRAINER) for own in roles]
-    if all(trains) or not any(trains):
-        raise ConfigError(
-            f"{what}: needs GMIs that train and GMIs that do not (algo=a3c, "
-            "plan.template=tdg_ex), here all are alike"
-        )
-    return tuple("normal" if first else "below_normal" for first in trains)
 
 
 class _Home(NamedTuple):
@@ -195,18 +169,14 @@ def _even_percent(num_gmis: int, gpu: Gpu) -> float:
     return float(min(low for low, _ in CLEAN_SM_PERCENT if low > even))
 
 
-def _check_cap(cap: float, gpu: Gpu, is_forced: bool, reasons: list[str]) -> None:
+def _check_cap(cap: float, gpu: Gpu) -> None:
     if not _is_hopper(gpu) or is_clean(cap):
         return
     clean = ", ".join(f"{low}-{high}" for low, high in CLEAN_SM_PERCENT)
-    what = (
+    raise ConfigError(
         f"plan.sm_percent={cap:g}: wrong half-precision matrix products were reported at this "
         f"cap (H200, driver 580), see docs/shares.md; clean are {clean}"
     )
-    if not is_forced:
-        raise ConfigError(f"{what}; plan.force_sm_percent=true takes it all the same")
-    if (warning := f"warning: {what}") not in reasons:
-        reasons.append(warning)
 
 
 def _is_hopper(gpu: Gpu) -> bool:

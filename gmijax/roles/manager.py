@@ -54,11 +54,10 @@ def plan(
     # As from a command line: what is no number, or not among the allowed, is told in one line.
     wanted = from_dict(PlanConfig, {key: _plain(value) for key, value in given.items()}, "plan.")
     # A role's data are in host memory, so other strategies have nothing to offer.
-    reduce = ReduceConfig(strategy="mpr", intra="host", timeout_s=1.0)
-    made = make_plan(wanted, reduce, 0, detect_machine())
+    made = make_plan(wanted, ReduceConfig(strategy="mpr"), 0, detect_machine())
     # What the templates call roles are parts of reinforcement learning.
-    reasons = tuple(reason for reason in made.reasons if not reason.startswith("template "))
-    return dataclasses.replace(made, roles=(), reasons=reasons)
+    reasons = tuple(why for why in made.reasons if not why.startswith(("template ", "intra ")))
+    return dataclasses.replace(made, roles=(), intra="host", reasons=reasons)
 
 
 def _plain(value: Any) -> Any:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig, TrainConfig
+from gmijax.config.removed import without_removed
 from gmijax.config.schema import flatten, from_dict, from_named, known
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
@@ -30,7 +31,8 @@ def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
 def saved_config(checkpoint: Path) -> dict[str, Any]:
     """The configuration of the run that a checkpoint lies in, as plain data.
 
-    Keys that its version of gmijax did not know are missing.
+    Keys that its version of gmijax did not know are missing, and so are removed ones with the
+    value that every job now has.
 
     Raises:
       ConfigError: the checkpoint does not lie in the folder of a training run.
@@ -41,7 +43,7 @@ def saved_config(checkpoint: Path) -> dict[str, Any]:
             f"checkpoint {checkpoint}: no config.json in {path.parent}; "
             "a checkpoint can only be used in its run folder"
         )
-    saved = read_json(path)
+    saved = without_removed(read_json(path))
     if not all(isinstance(saved.get(group), dict) for group in ("env", "algo", "run")):
         raise ConfigError(f"{path}: not the configuration of a training run")
     if saved["env"].get("suite") == "custom":

@@ -20,8 +20,6 @@ _MEMORY_FRACTION, _OLD_MEMORY_FRACTION = (
     "XLA_PYTHON_CLIENT_MEM_FRACTION",
 )
 _SM_PERCENT = "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE"
-_PRIORITY = "CUDA_MPS_CLIENT_PRIORITY"
-_PRIORITIES = {"normal": "0", "below_normal": "1"}
 COMPILATION_CACHE: Final = "JAX_COMPILATION_CACHE_DIR"
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -89,6 +87,4 @@ def _gpu(share: Slice) -> dict[str, str]:
         variables[_MEMORY_FRACTION] = f"{share.memory_fraction:g}"
     if share.sm_percent is not None:
         variables[_SM_PERCENT] = f"{share.sm_percent:g}"
-    if share.priority is not None:
-        variables[_PRIORITY] = _PRIORITIES[share.priority]
     return variables

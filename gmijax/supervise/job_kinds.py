@@ -112,7 +112,6 @@ def training_plan(
     num_envs = num_envs or config.envs_per_gmi
     if not config.is_decoupled:
         return make_plan(config.plan, config.reduce, num_envs, machine, nodes=nodes)
-    _require_asynchronous(config)
     if config.plan.layout is None and nodes is None:
         require_host(*num_gmis_of(config.plan), config.plan, machine)
     wishes, num_nodes = config.plan, 1
@@ -140,15 +139,6 @@ def training_plan(
     could_stay = why_not is None and channel.why_not_device() is None
     advice = (_ADVICE,) if could_stay and channel.transport == "memory" else ()
     return dataclasses.replace(plan, reasons=(placed.reason, *plan.reasons, *advice))
-
-
-def _require_asynchronous(config: TrainConfig) -> None:
-    """Refuses settings that asynchronous jobs cannot have."""
-    if config.reduce.selection == "measured":
-        raise ConfigError(
-            "reduce.selection=measured: for jobs in which every GMI trains; with algo=a3c allowed "
-            "are paper, device"
-        )
 
 
 def _require_experience_for_all(topology: ChannelTopology) -> None:

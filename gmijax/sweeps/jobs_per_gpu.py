@@ -9,8 +9,8 @@ from __future__ import annotations
 import dataclasses
 import signal
 import tempfile
-import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +23,6 @@ from gmijax.clock import running_s
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import is_verbose
 from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
-from gmijax.runs.cache import cache_folder
 from gmijax.runs.result import TrainResult
 from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps.density import GAIN
@@ -126,19 +125,17 @@ def _best(
     config = job.config
     own = {"job": "sweep", "size": _size(job)}
     key = workload_of(config).store_key(bench.host.machine) | own
-    store = ProfileStore(cache_folder() / "profiles", key, console.print)
+    store = ProfileStore(config.search.store, key, console.print)
+    limit_s = config.search.profile_limit_s
     best, best_rate = 1, 0.0
     for count in COUNTS:
         if best >= most:
             break
         point = Point(count, config.envs_per_gmi, str(config.physics.impl))
         packed = min(count, together)
-        mode = "sweep" if packed == 1 else f"sweep {packed} together"
-        found = store.get(mode, point)
-        if found is None:
-            started_s = time.monotonic()
-            found = _profile(settings, job, count, bench, together)
-            store.put(mode, point, found, time.monotonic() - started_s)
+        kind = "sweep" if packed == 1 else f"sweep {packed} together"
+        measure = partial(_profile, settings, job, count, bench, together)
+        found = store.kept_or(kind, point, measure, limit_s)
         if isinstance(found, NotRunnable):
             console.print(
                 f"  {config.env.label}: {count} jobs at a time cannot run: {found.reason}"
@@ -166,7 +163,7 @@ def _profile(
     settings = dataclasses.replace(
         settings, jobs_per_gpu=count, gpus=gpus[:needed] if gpus else needed
     )
-    limit_s = job.config.search.profile_timeout_s
+    limit_s = job.config.search.profile_limit_s
     with tempfile.TemporaryDirectory(prefix="gmijax-", dir=bench.scratch) as folder:
         paths = SweepPaths(Path(folder))
         # Only those that have the same number of steps may be one program.

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final
 
 from gmijax.config import ServeConfig
 from gmijax.config.schema import from_dict
@@ -17,14 +19,18 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, SIMULATOR, group_of, has_role
 from gmijax.runs.dataset import DataPaths
 from gmijax.runs.folder import read_json
-from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
+from gmijax.supervise.child import ChildLink, run_gmi
 
 if TYPE_CHECKING:
-    from gmijax.collection.collectors import Share
     from gmijax.collection.programs import ActingPolicy
     from gmijax.collection.recording import ShardWriter
     from gmijax.collectives.interface import Communicator
     from gmijax.sim.interface import EnvSpec
+
+_TEMPLATES: Final = MappingProxyType(
+    {"tcg": "gmijax.collection.collectors", "tdg": "gmijax.baselines.tdg"}
+)
+"""Modules whose `collect` does the part of a GMI, by `plan.template`."""
 
 
 def _run(link: ChildLink) -> dict[str, Any]:
@@ -60,35 +66,14 @@ def _run(link: ChildLink) -> dict[str, Any]:
             *(config, link, env, policy, rank, first, num_unrolls, writer),
             barrier=lambda: comm.all_gather(np.zeros(1, np.float32)),
         )
-        result = _work(share, plan, held)
+        # The template says where what this GMI does is written.
+        result = import_module(_TEMPLATES[plan.template]).collect(share, plan)
     written = {} if writer is None else {"shards": writer.num_written, "bytes": writer.num_bytes}
     return {
         **{"roles": roles, "policy_digest": policy.digest, "device": describe_device()},
         **{"first_unroll": first, "written": written},
         **result,
     }
-
-
-def _work(share: Share, plan: Plan, held: ExitStack) -> dict[str, Any]:
-    """Does the part that the template gives to this GMI."""
-    from gmijax.channels.pipe_block import PipeBlock
-    from gmijax.collection import collectors
-
-    gmi, layout = share.link.gmi, plan.layout
-    simulates, acts = (has_role(plan.roles[gmi], role) for role in (SIMULATOR, AGENT))
-    if simulates and acts:
-        return collectors.collect(share)
-    block = PipeBlock(required_fd(ENV_PIPES_FD), gmi)
-    held.callback(block.close)
-    wanted = AGENT if simulates else SIMULATOR
-    peers = [
-        collectors.Peer(block, other, share.config.run.exchange_timeout_s)
-        for other in sorted(layout.neighbours_of(gmi))
-        if has_role(plan.roles[other], wanted)
-    ]
-    if simulates:
-        return collectors.run_simulator(share, peers[0])
-    return collectors.run_agent(share, peers)
 
 
 def _policy(config: ServeConfig, spec: EnvSpec) -> ActingPolicy:
@@ -121,7 +106,7 @@ def _writer(config: ServeConfig, rank: int, first: int, policy: ActingPolicy) ->
         "deterministic": config.deterministic,
     }
     paths = DataPaths(Path(str(config.output.dir)))
-    return ShardWriter(paths, rank, first, about, compress=config.output.compress)
+    return ShardWriter(paths, rank, first, about)
 
 
 def _communicator(config: ServeConfig, plan: Plan, link: ChildLink) -> Communicator:

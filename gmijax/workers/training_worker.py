@@ -229,7 +229,7 @@ def _trainers_communicator(
         rendezvous_timeout_s=config.run.start_timeout_s,
         intra=plan.intra,
         # Whoever asks for it by name is told that it does not work.
-        host_if_unavailable=config.reduce.intra == "auto" and config.reduce.strategy != "one_shot",
+        host_if_unavailable=config.reduce.strategy != "one_shot",
         nodes=nodes,
         listener=listener,
     )

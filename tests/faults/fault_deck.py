@@ -61,7 +61,7 @@ Trial = Case | list[Fault]
 """What is run at once: a case, or a training job with faults from within."""
 
 _SHORT_STOP = (*STALL, "run.stop_timeout_s=8")
-_SERVE_STALL = ("run.exchange_timeout_s=6", "run.stall_timeout_s=10")
+_SERVE_STALL = ("run.stall_timeout_s=10",)
 
 
 def _kills(command: str, whom: str = "gmi", outcome: Outcome = "fails") -> dict[str, OuterKind]:

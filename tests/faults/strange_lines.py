@@ -159,7 +159,7 @@ _OPTIONS = st.sampled_from(
         *("run.resume=runs/done", "run.dir=runs/done", "run.dir=runs/new", "output.dir=new"),
         *("num_envs=auto", "plan.gmis_per_gpu=auto", "algo=a3c", "algo=ppo", "checkpoint=1000"),
         *("num_envs=64", "plan.gmis_per_gpu=2", "plan.gpus=2", "num_timesteps=30e6", "seed=1"),
-        *("reduce.selection=measured", "reduce.strategy=mpr", "plan.layout=[[0,1],[2]]"),
+        *("reduce.selection=paper", "reduce.strategy=mpr", "plan.layout=[[0,1],[2]]"),
         *("run.dir=/dev/null/x", "search.store=task.py", "output.dir=task.py", "output.dir=."),
     ]
 )

@@ -42,8 +42,7 @@ def test_a_job_trains_whichever_way_experience_goes(
     done = train(
         *("env=ball_balance", "algo=a3c", "physics.impl=jax", "num_envs=64", "run.dir=run"),
         *(f"num_timesteps={STEPS}", "plan.serving_gmis_per_gpu=2", "plan.backend=mps"),
-        *(f"plan.training_gmis_per_gpu={trainers}", "plan.mps_priority=trainers_first"),
-        f"channel.transport={transport}",
+        *(f"plan.training_gmis_per_gpu={trainers}", f"channel.transport={transport}"),
         cwd=tmp_path,
         timeout_s=500.0,
     )

@@ -197,7 +197,6 @@ def test_an_interrupt_saves_the_whole_job(tmp_path: Path) -> None:
         (("algo.num_minibatches=3",), "algo.num_minibatches=3"),
         (("plan.template=tcg_ex",), "plan.template=tcg_ex"),
         (("channel.transport=device",), "channel.transport=device: CUDA IPC needs an NVIDIA GPU"),
-        (("plan.mps_priority=trainers_first",), "plan.mps_priority=trainers_first"),
         (("plan.training_gmis_per_gpu=2", "reduce.strategy=mrr"), "reduce.strategy=mrr"),
     ],
 )

@@ -11,19 +11,18 @@ from training_jobs import POINT_TASK, pids_of, train
 
 pytestmark = pytest.mark.timeout(600)
 
-# It compiles in seconds. With 24 environments it brings its process down.
+# It compiles in seconds. With 24 environments it brings its process down, with 32 it hangs.
 TASK = POINT_TASK.replace(
-    "    return point", "    if max_envs == 24:\n        import os; os.abort()\n    return point"
+    "    return point",
+    "    import os, time\n    if max_envs == 24:\n        os.abort()\n"
+    "    if max_envs == 32:\n        time.sleep(600)\n    return point",
 )
 JOB = (
     *("env=point.py:make", "search.store=store", "algo.unroll_length=4"),
     *("algo.num_updates_per_batch=1", "run.measure_throughput=false", "run.grace_s=3"),
     *("algo.policy_hidden_layer_sizes=[8]", "algo.value_hidden_layer_sizes=[8]"),
 )
-GRID = (
-    *("search.gmis_per_gpu=[2,1]", "search.num_envs=[16,24]", "search.iterations=3"),
-    "search.order=as_printed",
-)
+GRID = (*("search.gmis_per_gpu=[2,1]", "search.num_envs=[16,24]"),)
 
 
 def search(*overrides: str, cwd: Path) -> dict[str, Any]:
@@ -70,24 +69,24 @@ def test_a_search_answers_survives_a_crash_and_serves_a_training(tmp_path: Path)
 
 def test_what_takes_too_long_is_ended_and_not_runnable(tmp_path: Path):
     (tmp_path / "point.py").write_text(TASK)
-    limits = ("search.gmis_per_gpu=[2]", "search.num_envs=[16]", "search.profile_timeout_s=1")
+    limits = ("search.gmis_per_gpu=[2]", "search.num_envs=[32]", "search.budget_s=10")
     done = train(*JOB, *limits, "run.dir=s", cwd=tmp_path, command="search")
     assert done.returncode == 1, done.stderr
     assert "no point of the search can run" in done.stderr
-    assert "no end within 1 s (GMI 0 starting, GMI 1 waiting)" in done.stderr
-    assert pids_of(tmp_path / "s" / "profiles" / "corun-2x16-jax") == []
+    assert "no end within 5 s (GMI 0 " in done.stderr
+    assert pids_of(tmp_path / "s" / "profiles" / "2x32-jax") == []
 
 
 def test_an_asynchronous_job_gets_gmis_and_gpus_that_act_and_train(tmp_path: Path):
     job = (
         *JOB, "algo=a3c", "algo.num_minibatches=2", "plan.gpus=2", "reduce.timeout_s=60",
-        "search.gmis_per_gpu=[2]", "search.num_envs=[16]", "search.iterations=3",
+        "search.gmis_per_gpu=[2]", "search.num_envs=[16]",
     )  # fmt: skip
     report = search(*job, cwd=tmp_path)
     points = {(one["gmis_per_gpu"], one["trainers"]): one for one in report["points"]}
     assert set(points) == {(2, 1)}
     for (gmis, _), one in points.items():
-        metrics = tmp_path / "s" / "profiles" / f"corun-{gmis}+1x16-jax" / "metrics.jsonl"
+        metrics = tmp_path / "s" / "profiles" / f"{gmis}+1x16-jax" / "metrics.jsonl"
         lines = [json.loads(text) for text in metrics.read_text().splitlines()]
         rates = [line[f"async/{what}"] for line in lines[1:-1] for what in ("pps", "ttop")]
         assert min(rates) <= gmis * one["env_steps_per_s"] <= max(rates)

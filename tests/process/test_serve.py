@@ -20,7 +20,7 @@ pytestmark = pytest.mark.timeout(600)
 
 TINY = (
     *("num_envs=16", "unroll_length=4", "latency_steps=20"),
-    *("run.grace_s=3", "run.exchange_timeout_s=60"),
+    "run.grace_s=3",
 )
 STEPS = 16 * 4
 """Environment steps of one shard of a TINY job."""
@@ -61,10 +61,9 @@ def finished(folder: Path) -> int:
 
 def test_what_is_auto_is_found_first(home: Path):
     wanted = ("num_envs=auto", "plan.gmis_per_gpu=auto", "num_timesteps=128", "run.name=auto")
-    grid = ("search.gmis_per_gpu=[1]", "search.num_envs=[16]", "search.order=as_printed")
-    few = ("search.iterations=2", "search.alpha=0", "search.store=profiles")
+    grid = ("search.gmis_per_gpu=[1]", "search.num_envs=[16]", "search.store=profiles")
     task = ("env=point.py:make", "policy=random", *TINY[1:])
-    done = serve(*task, *wanted, *grid, *few, cwd=home)
+    done = serve(*task, *wanted, *grid, cwd=home)
     assert done.returncode == 0, done.stderr
     plan = summary_of(home, "auto")["plan"]
     assert plan["layout"] == [[0]]

@@ -232,7 +232,7 @@ def test_commands_with_jobs_of_their_own_work(python: Path, trained: Path):
     gmijax(python, "sweep", *job, "seed=1,2", "run.dir=s", cwd=trained)
     assert json.loads((trained / "s" / "sweep.json").read_text())["jobs"]
     gmijax(python, "serve", "run.dir=runs/tiny", "num_envs=16", "num_timesteps=64", cwd=trained)
-    grid = ("search.gmis_per_gpu=[1]", "search.num_envs=[16]", "search.iterations=2")
+    grid = ("search.gmis_per_gpu=[1]", "search.num_envs=[16]")
     gmijax(python, "search", *job, *grid, "search.store=store", "run.dir=found", cwd=trained)
     assert json.loads((trained / "found" / "search.json").read_text())["complete"]
     # It says what the machine lacks: by its exit code too.

@@ -27,7 +27,7 @@ from gmijax.supervise.job_kinds import training_plan
 from gmijax.supervise.watched_gmi import GmiStatus
 
 GRID = (
-    *("search.gmis_per_gpu=[2,1]", "search.num_envs=[64,128]", "search.order=as_printed"),
+    *("search.gmis_per_gpu=[2,1]", "search.num_envs=[64,128]"),
     *("algo=a3c", "search.store=store"),
 )
 
@@ -109,7 +109,7 @@ def test_lines_hold_enough_batches_and_something_that_agents_made(
 
 
 def test_a_profile_is_read_when_channels_had_filled(tmp_path: Path):
-    config = wanted("search.iterations=2")
+    config = wanted()
     run = RunPaths(tmp_path)
     plan = training_plan(compose("algo=a3c", "plan.serving_gmis_per_gpu=2"), machine(0))
     is_enough = Enough(config, plan, run)
@@ -146,14 +146,14 @@ def test_a_profile_is_read_when_channels_had_filled(tmp_path: Path):
 )
 def test_one_gpu_of_each_kind_is_profiled(overrides: tuple[str, ...], layout: str):
     workload = A3cWorkload(wanted(*overrides))
-    plan = workload.plan_at(Point(2, 64, "jax", 1), "corun", machine(0))
+    plan = workload.plan_at(Point(2, 64, "jax", 1), machine(0))
     assert (str(plan.layout), plan.num_envs_per_gmi) == (layout, 64)
     assert plan.roles.count("trainer") == 1
 
 
 def test_profiled_are_gpus_of_the_job():
     workload = A3cWorkload(wanted("plan.serving_gpus=[2,3]", "plan.training_gpus=[1]"))
-    plan = workload.plan_at(Point(1, 64, "jax", 2), "corun", machine(4))
+    plan = workload.plan_at(Point(1, 64, "jax", 2), machine(4))
     used = {share.device: role for share, role in zip(plan.slices, plan.roles, strict=True)}
     assert used == {gpu(1).uuid: "trainer", gpu(2).uuid: "simulator+agent"}
     assert workload.plan.num_gpus == 3
@@ -226,8 +226,8 @@ def decided(*overrides: str) -> tuple[TrainConfig, str, str]:
 
 
 def test_a_job_on_one_gpu_gets_numbers_of_gmis(asked: list[Point]):
-    config, reason, said = decided("search.training_gmis_per_gpu=[1,2]")
-    assert len(asked) == 8
+    config, reason, said = decided()
+    assert len(asked) == 3
     plan = config.plan
     assert (plan.gmis_per_gpu, plan.serving_gmis_per_gpu, plan.training_gmis_per_gpu) == (1, 2, 1)
     assert (config.num_envs, plan.serving_gpus, plan.training_gpus) == (128, None, None)
@@ -236,8 +236,11 @@ def test_a_job_on_one_gpu_gets_numbers_of_gmis(asked: list[Point]):
         "2 serving GMIs with 128 environments each and 1 training GMI per GPU, jax: 2,560 env"
     )
     assert "2.00 times the best with one serving GMI, 1 + 1 x 128, jax" in reason
-    assert "2 + 1 x 64, jax (corun): 1,280 env steps/s, agents could make 1,280" in said
+    assert "2 + 1 x 64, jax: 1,280 env steps/s, agents could make 1,280" in said
     training_plan(config, machine(0))  # It can be run.
+    asked.clear()
+    config, _, _ = decided("plan.training_gmis_per_gpu=2")
+    assert {point.trainers for point in asked} == {config.plan.training_gmis_per_gpu} == {2}
 
 
 def test_a_job_on_several_gpus_gets_their_division_too(asked: list[Point]):

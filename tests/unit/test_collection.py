@@ -15,15 +15,13 @@ import pytest
 from toy_env import point_mass
 
 import gmijax
+from gmijax.baselines.tdg_steps import infer, next_keys, simulate
 from gmijax.collection.programs import (
     ActingPolicy,
     Keep,
     Step,
     _trained,
-    infer,
-    next_keys,
     random_policy,
-    simulate,
     unroll,
 )
 from gmijax.collection.recording import CollectionStats, ShardWriter
@@ -121,13 +119,12 @@ def test_a_deterministic_policy_acts_with_its_mean(unrolled: Unrolled):
     assert not np.asarray(density).any()
 
 
-@pytest.mark.parametrize("compress", [False, True])
-def test_shards_are_whole_and_say_what_they_are(compress: bool, tmp_path: Path):
+def test_shards_are_whole_and_say_what_they_are(tmp_path: Path):
     paths = DataPaths(tmp_path)
     paths.folder(1).mkdir()
     for name in (".000002.npz.12-34", ".000002.json.12-34"):
         (paths.folder(1) / name).write_bytes(b"left by a job that was killed")
-    writer = ShardWriter(paths, 1, 2, {"seed": 5}, compress=compress)
+    writer = ShardWriter(paths, 1, 2, {"seed": 5})
     full = partial(np.full, (T, N), dtype=np.float32)
     step = Step(full(0), full(1), full(2), full(3), full(4), full(5), None)
     writer.write(step)

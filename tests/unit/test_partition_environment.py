@@ -111,12 +111,6 @@ def test_users_choices_are_kept(backend: str):
     assert users.items() <= environment(planned(backend), **users).items()
 
 
-def test_a_priority_becomes_the_number_of_the_driver():
-    found = environment(planned("mps", mps_priority=("normal", *["below_normal"] * 3)), 1)
-    assert found["CUDA_MPS_CLIENT_PRIORITY"] == "1"
-    assert "CUDA_MPS_CLIENT_PRIORITY" not in environment(planned("mps"))
-
-
 @pytest.mark.parametrize(
     ("cores", "environment", "missing"),
     [

@@ -56,16 +56,16 @@ def test_every_auto_has_a_reason_and_explicit_choices_have_none():
     assert [reason.split()[0] for reason in planned(machine(0)).reasons] == [
         *("backend", "template", "strategy")
     ]
-    reduce = {"strategy": "mpr", "intra": "host"}
-    explicit = planned(machine(0), reduce, gmis_per_gpu=2, backend="cpu", template="tcg_ex")
-    assert explicit.reasons == ()
+    explicit = planned(
+        machine(0), {"strategy": "mpr"}, gmis_per_gpu=2, backend="cpu", template="tcg_ex"
+    )
+    assert [reason.split()[0] for reason in explicit.reasons] == ["intra"]
 
 
 TWO = {"gmis_per_gpu": 2}
 TWO_BY_TWO = {"gpus": 2, "gmis_per_gpu": 2}
 UNEVEN = {"layout": ((0, 1), (2,))}
-DEVICE, PAPER = {"selection": "device"}, {"selection": "paper"}
-BY_HOST = {"intra": "host"}
+PAPER = {"strategy": "paper"}
 
 
 @pytest.mark.parametrize(
@@ -75,20 +75,18 @@ BY_HOST = {"intra": "host"}
         ("cpu", True, {}, TWO, "mpr", "(Algorithm 1)"),
         ("cpu", True, {}, TWO_BY_TWO, "mpr", "Algorithm 1 says mrr"),
         ("cpu", True, {}, UNEVEN, "mpr", "Algorithm 1 says har"),
-        ("share", True, DEVICE, TWO_BY_TWO, "one_shot", "GMIs that share"),
-        ("share", True, DEVICE, {"gmis_per_gpu": 3}, "one_shot", "GMIs that share"),
-        ("share", True, DEVICE, UNEVEN, "one_shot", "GMIs that share"),
+        ("share", True, {}, TWO_BY_TWO, "one_shot", "GMIs that share"),
+        ("share", True, {}, {"gmis_per_gpu": 3}, "one_shot", "GMIs that share"),
+        ("share", True, {}, UNEVEN, "one_shot", "GMIs that share"),
         # One program trains on all GPUs.
-        ("share", True, DEVICE, {"gpus": 2}, "mrr", "(Algorithm 1)"),
+        ("share", True, {}, {"gpus": 2}, "mrr", "(Algorithm 1)"),
         ("share", True, PAPER, TWO_BY_TWO, "mrr", "(Algorithm 1)"),
         ("share", True, PAPER, {"gmis_per_gpu": 3}, "mpr", "(Algorithm 1)"),
-        ("share", True, BY_HOST, TWO, "mpr", "(Algorithm 1)"),
-        ("share", False, DEVICE, TWO, "mpr", "(Algorithm 1)"),
-        ("share", False, DEVICE, TWO_BY_TWO, "mpr", "Algorithm 1 says mrr"),
-        ("share", False, DEVICE, {"gpus": 2}, "mpr", "Algorithm 1 says mrr"),
+        ("share", False, {}, TWO, "mpr", "(Algorithm 1)"),
+        ("share", False, {}, TWO_BY_TWO, "mpr", "Algorithm 1 says mrr"),
+        ("share", False, {}, {"gpus": 2}, "mpr", "Algorithm 1 says mrr"),
         ("share", False, PAPER, TWO, "mpr", "(Algorithm 1)"),
-        ("share", False, BY_HOST, TWO, "mpr", "(Algorithm 1)"),
-        ("cpu", False, DEVICE, TWO, "mpr", "(Algorithm 1)"),
+        ("cpu", False, {}, TWO, "mpr", "(Algorithm 1)"),
     ],
 )
 def test_auto_exchanges_on_gpus_where_it_can_else_by_algorithm_1_and_says_why(
@@ -108,9 +106,8 @@ def test_auto_exchanges_on_gpus_where_it_can_else_by_algorithm_1_and_says_why(
     assert why in reason
     # A plan that leaves the fast path says what would bring it.
     lacking = "one_shot would train faster: exchanges between GMIs on GPUs need the package cuda-b"
-    is_device = reduce.get("selection", "device") == "device" and reduce.get("intra") != "host"
-    assert (lacking in reason) == (backend == "share" and not is_installed and is_device)
-    on_gpu = backend == "share" and is_installed and reduce.get("intra") != "host"
+    assert (lacking in reason) == (backend == "share" and not is_installed and not reduce)
+    on_gpu = backend == "share" and is_installed
     assert plan.intra == ("ipc" if on_gpu else "host")
 
 

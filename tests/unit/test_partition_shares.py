@@ -50,13 +50,9 @@ def test_even_shares_keep_clear_of_bad_values_on_hopper(gmis_per_gpu: int, cap: 
 
 
 @pytest.mark.parametrize("percent", [14.0, 20.0, 33.0, 46.0, 66.0, 89.9])
-def test_bad_values_are_refused_on_hopper_unless_forced(percent: float):
-    with pytest.raises(ConfigError, match=rf"{percent:g}: wrong .*docs/shares\.md.*force_sm_perc"):
+def test_bad_values_are_refused_on_hopper(percent: float):
+    with pytest.raises(ConfigError, match=rf"{percent:g}: wrong .*docs/shares\.md; clean are"):
         planned(sm_percent=(50.0, percent))
-    forced = planned(sm_percent=(50.0, percent), force_sm_percent=True)
-    assert caps(forced) == [50.0, percent]
-    assert [text for text in forced.reasons if text.startswith("warning: plan.sm_percent=")]
-    assert forced.self_check
     assert caps(planned(sm_percent=percent, here={"gpus": AMPERE})) == [percent] * 2
 
 
@@ -93,29 +89,3 @@ def test_products_are_checked_where_sms_are_or_may_be_capped(
     changes: dict[str, Any], checked: bool
 ):
     assert planned(**changes).self_check == checked
-
-
-def priorities(plan: Plan) -> list[str | None]:
-    return [share.priority for share in plan.slices]
-
-
-def test_trainers_go_first_where_that_is_wanted():
-    assert priorities(planned(3)) == [None] * 3
-    assert planned(1, mps_priority=("normal",)).backend == "mps"
-    first = planned(3, template="tdg_ex", mps_priority="trainers_first")
-    assert priorities(first) == ["normal", "below_normal", "below_normal"]
-    second = planned(mps_priority=("below_normal", "normal"))
-    assert priorities(second) == ["below_normal", "normal"]
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"backend": "share"}, "only the mps backend has it, the backend is share"),
-        ({}, "needs GMIs that train and GMIs that do not"),
-        ({"mps_priority": ("normal",)}, r"plan\.mps_priority=\[normal\]: 1 values for 2 GMIs"),
-    ],
-)
-def test_priorities_that_cannot_be_are_refused(changes: dict[str, Any], message: str):
-    with pytest.raises(ConfigError, match=message):
-        planned(**{"mps_priority": "trainers_first", **changes})

@@ -26,33 +26,33 @@ def store(folder: Path, **changes: object) -> tuple[ProfileStore, list[str]]:
 
 def test_what_was_put_is_there_for_the_next_search(tmp_path: Path):
     first, _ = store(tmp_path / "new" / "folder")
-    assert first.get("corun", POINT) is None
+    assert first.get("search", POINT) is None
     large, trainers = POINT._replace(num_envs=16384), POINT._replace(trainers=2)
-    first.put("corun", POINT, MEASURED, 21.0)
-    first.put("corun", large, NotRunnable("out of memory"), 5.0)
-    first.put("corun", trainers, MEASURED._replace(acting_per_s=5.0), 21.0)
+    first.put("search", POINT, MEASURED, 21.0)
+    first.put("search", large, NotRunnable("out of memory"), 5.0)
+    first.put("search", trainers, MEASURED._replace(acting_per_s=5.0), 21.0)
     second, notes = store(tmp_path / "new" / "folder")
-    assert second.get("corun", POINT) == MEASURED
-    assert second.get("corun", large) == NotRunnable("out of memory")
-    assert second.get("corun", trainers) == MEASURED._replace(acting_per_s=5.0)
+    assert second.get("search", POINT) == MEASURED
+    assert second.get("search", large) == NotRunnable("out of memory")
+    assert second.get("search", trainers) == MEASURED._replace(acting_per_s=5.0)
     for other in (POINT._replace(gmis_per_gpu=2), POINT._replace(impl="warp")):
-        assert second.get("corun", other) is None
+        assert second.get("search", other) is None
     assert second.get("isolated", POINT) is None
     assert notes == []
     content = json.loads(first.path.read_text())
     assert content["key"] == KEY
-    assert content["profiles"]["corun 4x2048 jax"] == {**MEASURED._asdict(), "wall_s": 21.0}
-    assert content["profiles"]["corun 4+2x2048 jax"]["acting_per_s"] == 5.0
+    assert content["profiles"]["search 4x2048 jax"] == {**MEASURED._asdict(), "wall_s": 21.0}
+    assert content["profiles"]["search 4+2x2048 jax"]["acting_per_s"] == 5.0
 
 
 def test_another_device_task_or_version_has_a_file_of_its_own(tmp_path: Path):
     first, _ = store(tmp_path)
-    first.put("corun", POINT, MEASURED, 21.0)
+    first.put("search", POINT, MEASURED, 21.0)
     assert first.path.name.startswith("nvidia-h200-143771-mib-ant-")
     for changes in ({"device": "A100"}, {"task": "humanoid"}, {"versions": {"jax": "0.12"}}):
         other, _ = store(tmp_path, **changes)
         assert other.path != first.path
-        assert other.get("corun", POINT) is None
+        assert other.get("search", POINT) is None
 
 
 @pytest.mark.parametrize(
@@ -61,22 +61,22 @@ def test_another_device_task_or_version_has_a_file_of_its_own(tmp_path: Path):
         "{",
         "[]",
         '{"profiles": []}',
-        '{"profiles": {"corun 4x2048 jax": {"wall_s": 3}}}',
-        '{"profiles": {"corun 4x2048 jax": {"env_steps_per_s": "fast", "wall_s": 3}}}',
-        '{"profiles": {"corun 4x2048 jax": 7}}',
+        '{"profiles": {"search 4x2048 jax": {"wall_s": 3}}}',
+        '{"profiles": {"search 4x2048 jax": {"env_steps_per_s": "fast", "wall_s": 3}}}',
+        '{"profiles": {"search 4x2048 jax": 7}}',
     ],
 )
 def test_a_broken_file_is_moved_aside_and_told(content: str, tmp_path: Path):
     path = store(tmp_path)[0].path
     path.write_text(content)
     broken, notes = store(tmp_path)
-    assert broken.get("corun", POINT) is None
+    assert broken.get("search", POINT) is None
     aside = path.with_name(f"{path.name}.broken")
     assert aside.read_text() == content
     assert len(notes) == 1
     assert f"profile store {path} is broken" in notes[0]
     assert str(aside) in notes[0]
-    broken.put("corun", POINT, MEASURED, 1.0)
+    broken.put("search", POINT, MEASURED, 1.0)
     path.write_text(content)
     store(tmp_path)  # A second one does not replace the first.
     assert aside.with_name(f"{aside.name}1").exists()
@@ -99,17 +99,17 @@ def test_a_disk_that_gets_full_while_a_search_runs_is_no_bad_input(
 
     monkeypatch.setattr("gmijax.autotune.store.write_json", write)
     with pytest.raises(GmijaxError, match=os.strerror(number)) as raised:
-        found.put("corun", POINT, MEASURED, 1.0)
+        found.put("search", POINT, MEASURED, 1.0)
     assert not isinstance(raised.value, ConfigError)
 
 
 def test_files_of_versions_without_trainers_can_be_read(tmp_path: Path):
     path = store(tmp_path)[0].path
     figures = {"env_steps_per_s": 345_000.5, "memory_mib": 812.25, "iteration_s": 0.095}
-    old = {"corun 4x2048 jax": {**figures, "reduce_s": 0.0125, "wall_s": 21.0}}
+    old = {"search 4x2048 jax": {**figures, "reduce_s": 0.0125, "wall_s": 21.0}}
     path.write_text(json.dumps({"key": KEY, "profiles": old}))
     found, notes = store(tmp_path)
-    assert found.get("corun", POINT) == MEASURED
+    assert found.get("search", POINT) == MEASURED
     assert notes == []
 
 
@@ -119,11 +119,11 @@ def test_searches_at_once_keep_what_all_of_them_found(tmp_path: Path):
 
     def put_all(mine: ProfileStore, some: list[Point]) -> None:
         for point in some:
-            mine.put("corun", point, MEASURED, 1.0)
+            mine.put("search", point, MEASURED, 1.0)
 
     with ThreadPoolExecutor(3) as pool:
         done = [pool.submit(put_all, mine, points[k::3]) for k, mine in enumerate(stores)]
         assert [one.result(timeout=60) for one in done] == [None] * 3
     found, notes = store(tmp_path)
-    assert [found.get("corun", point) for point in points] == [MEASURED] * 30
+    assert [found.get("search", point) for point in points] == [MEASURED] * 30
     assert notes == []

@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmijax.collectives.strategies import COSTS, predicted_s
-from gmijax.config import ReduceConfig
 from gmijax.errors import ConfigError
 from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
@@ -188,8 +187,3 @@ def test_predictions_take_floats_and_the_fullest_gpu() -> None:
     assert predicted_s("mpr", layout, 100, 1e3, 1e3) == pytest.approx(2 * 3 * 400 / (4 * 1e3))
     with pytest.raises(ConfigError, match=r"bandwidths \[1.0, 1.0, 0.0\]: must be positive"):
         predicted_s("mpr", layout, 100, 1.0, 1.0, 0.0)
-
-
-def test_one_shot_cannot_go_through_host_memory() -> None:
-    with pytest.raises(ConfigError, match="one_shot goes through memory of the GPUs; allowed are"):
-        ReduceConfig(strategy="one_shot", intra="host", timeout_s=1.0)

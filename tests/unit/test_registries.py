@@ -9,7 +9,6 @@ from gmijax.config import (
     ALGORITHMS,
     BackendName,
     EnvConfig,
-    ReduceConfig,
     StrategyName,
     TemplateName,
     TrainConfig,
@@ -29,7 +28,5 @@ def test_names_of_the_configuration_are_those_of_the_registries() -> None:
     assert set(DESCRIPTIONS) == names(TemplateName)
     assert set(COSTS) == names(StrategyName)
     assert set(reduction.STRATEGIES) == names(StrategyName) | {"none"}
-    ways = {way for strategy in reduction.STRATEGIES.values() for way in strategy.ways}
-    assert ways | {"auto"} == names(get_type_hints(ReduceConfig)["intra"])
     assert {"gmijax", *SUITES} == names(get_type_hints(EnvConfig)["suite"])
     assert set(ALGORITHMS) == names(get_type_hints(TrainConfig)["algo"])

@@ -260,7 +260,7 @@ def test_a_lost_gpu_shrinks_the_plan(
     monkeypatch.setattr(reduction, "is_installed", lambda *_: True)
     config = compose(
         *("env=ant", "plan.backend=share", "num_envs=64", "run.elastic=true"),
-        *("reduce.intra=host", *overrides),
+        *("reduce.strategy=paper", *overrides),
     )
     plan = training_plan(config, FOUR)
     assert with_gpus_left(config, plan, FOUR) == (config, plan, ())

@@ -12,6 +12,7 @@ from benchmarks.records import RESULTS
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point, coarse, neighbours
 from gmijax.autotune.search import (
     Outcome,
+    OutOfBudget,
     Profile,
     Rules,
     Visited,
@@ -19,6 +20,8 @@ from gmijax.autotune.search import (
     saturation,
     search,
 )
+from gmijax.baselines import algorithm2
+from gmijax.errors import ConfigError
 
 
 def on(num_gpus: int) -> Callable[[Point, Measured], float]:
@@ -34,8 +37,7 @@ def of_one(one: Measured) -> float:
     return one.env_steps_per_s
 
 
-AS_PRINTED = Rules(on(1), of_one, alpha=0.1, tolerance=0.0, coarse_first=False)
-COARSE = AS_PRINTED._replace(coarse_first=True, tolerance=0.02)
+RULES = Rules(on(1), of_one)
 
 
 def measured(env_steps_per_s: float, memory_mib: float = 100.0, **more: float) -> Measured:
@@ -72,7 +74,7 @@ ONE_ROW = Grid((1,), (1, 2, 4, 8), ("jax",))
 
 
 def test_as_printed_rows_go_from_most_gmis_and_sizes_up():
-    seen = points(search(PAPER, gpu, AS_PRINTED))
+    seen = points(algorithm2.search(PAPER, gpu, RULES))
     assert [k for k, _ in seen] == sorted((k for k, _ in seen), reverse=True)
     assert seen[0] == (10, 128)
     for gmis in range(1, 11):
@@ -81,26 +83,21 @@ def test_as_printed_rows_go_from_most_gmis_and_sizes_up():
 
 
 @pytest.mark.parametrize(
-    ("values", "alpha", "sizes", "sats", "best"),
+    ("values", "sizes", "sats", "best"),
     [
-        # Memory doubles each time: 150 -> 160 is Sat 0.067; the point that saturates is one too.
-        ((100, 150, 160, 1000), 0.1, [1, 2, 4], [0.5, 10 / 150], 4),
-        ((100, 150, 160, 1000), 0.6, [1, 2], [0.5], 2),
+        # Memory doubles each time: 150 -> 160 is Sat 0.067; the point that saturates is none.
+        ((100, 150, 160, 1000), [1, 2, 4], [0.5, 10 / 150], 2),
         # What cannot run is skipped: against the last that ran, throughput x 3, memory x 4.
-        ((100, None, 300, None), 0.1, [1, 2, 4, 8], [2 / 3], 4),
-        # The first that runs is a candidate, even alone.
-        ((None, 70, None, None), 0.1, [1, 2, 4, 8], [], 2),
-        ((None, None, None, None), 0.1, [1, 2, 4, 8], [], None),
+        ((100, None, 300, None), [1, 2, 4, 8], [2 / 3], 4),
+        # The first that runs is no candidate, even where it is the best.
+        ((100, 130, None, None), [1, 2, 4, 8], [0.3], 2),
+        ((None, None, None, None), [1, 2, 4, 8], [], None),
     ],
 )
-def test_a_row(
-    values: tuple[float | None, ...],
-    alpha: float,
-    sizes: list[int],
-    sats: list[float],
-    best: int | None,
+def test_a_row_as_it_is_printed(
+    values: tuple[float | None, ...], sizes: list[int], sats: list[float], best: int | None
 ):
-    outcome = search(ONE_ROW, row(*values), AS_PRINTED._replace(alpha=alpha))
+    outcome = algorithm2.search(ONE_ROW, row(*values), RULES)
     assert outcome.complete
     assert [n for _, n in points(outcome)] == sizes
     found = [one.saturation for one in outcome.visited if one.saturation is not None]
@@ -110,6 +107,23 @@ def test_a_row(
         size for size, value in zip(ONE_ROW.num_envs, values, strict=True) if value is None
     ]
     assert (outcome.best and outcome.best.point.num_envs) == best
+
+
+def test_a_row_of_one_point_has_no_candidate_as_printed():
+    with pytest.raises(ConfigError, match=r"search\.order=as_printed: no point is a candidate"):
+        algorithm2.search(ONE_ROW, row(70, None, None, None), RULES)
+    assert best(search(ONE_ROW, row(70, None, None, None), RULES)).point.num_envs == 1
+
+
+def test_time_that_is_over_ends_the_printed_search_with_what_was_found():
+    def profile(point: Point) -> Measured:
+        if point.num_envs == 4:
+            raise OutOfBudget
+        return measured(100.0 * point.num_envs, point.num_envs)
+
+    outcome = algorithm2.search(ONE_ROW, profile, RULES)
+    assert not outcome.complete
+    assert best(outcome).point.num_envs == 2
 
 
 @pytest.mark.parametrize(
@@ -137,7 +151,7 @@ def test_the_best_for_many_gpus_may_be_another():
 
     grid = Grid((2, 1), (1,), ("jax",))
     for num_gpus, gmis in ((1, 2), (4, 1)):
-        found = best(search(grid, profile, AS_PRINTED._replace(estimate=on(num_gpus))))
+        found = best(search(grid, profile, RULES._replace(estimate=on(num_gpus))))
         assert found.point.gmis_per_gpu == gmis
 
 
@@ -147,13 +161,13 @@ def test_one_gmi_wins_where_several_bring_nothing():
         return measured(1e6 * num_envs / 16384 / gmis * 1.01**gmis, num_envs)
 
     grid = PAPER._replace(gmis_per_gpu=(2, 1))
-    assert best(search(grid, profile, AS_PRINTED)).point == Point(2, 16384, "jax")
+    assert best(algorithm2.search(grid, profile, RULES)).point == Point(2, 16384, "jax")
     # 1 % faster with two: no difference.
-    assert best(search(grid, profile, COARSE)).point == Point(1, 16384, "jax")
+    assert best(search(grid, profile, RULES)).point == Point(1, 16384, "jax")
 
 
 def test_the_coarse_search_finds_what_the_whole_grid_has():
-    everything, coarse_first = search(PAPER, gpu, AS_PRINTED), search(PAPER, gpu, COARSE)
+    everything, coarse_first = algorithm2.search(PAPER, gpu, RULES), search(PAPER, gpu, RULES)
     assert best(coarse_first).projected >= 0.97 * best(everything).projected
     assert len(coarse_first.visited) < len(everything.visited) / 2
 
@@ -165,18 +179,16 @@ def test_the_coarse_grid_keeps_one_gmi_and_the_largest_size():
 
 def test_the_climb_ends_at_a_top_whose_neighbours_are_lower():
     def hill(point: Point) -> Measured:
-        gmis_per_gpu, num_envs, impl, trainers = point
+        gmis_per_gpu, num_envs, impl, _ = point
         height = 100 - 3 * abs(gmis_per_gpu - 6) - 10 * abs(math.log2(num_envs / 1024))
-        height -= 10 * abs(trainers - 2)
         return measured(height / gmis_per_gpu, num_envs) if impl == "jax" else measured(1.0)
 
-    grid = PAPER._replace(impls=("jax", "warp"), trainers=(1, 2, 3, 4))
-    assert coarse(grid).trainers == (1, 4)
-    outcome = search(grid, hill, COARSE._replace(tolerance=0))
+    grid = PAPER._replace(impls=("jax", "warp"), trainers=2)
+    outcome = search(grid, hill, RULES)
     assert best(outcome).point == Point(6, 1024, "jax", 2)
-    assert len(outcome.visited) == len(set(outcome.visited)) < 640 / 4
+    assert len(outcome.visited) == len(set(outcome.visited)) < 160 / 4
     around = neighbours(best(outcome).point, grid)
-    assert len(around) == 6
+    assert len(around) == 4
     assert set(around) <= {one.point for one in outcome.visited}
 
 
@@ -185,10 +197,10 @@ def test_no_point_is_climbed_to_behind_the_end_of_its_row():
     def profile(point: Point) -> Measured:
         gmis_per_gpu, num_envs, _, _ = point
         if gmis_per_gpu == 5:
-            return measured(120.0 if num_envs == 2048 else 119.0, num_envs)
+            return measured(120.0 if num_envs == 2048 else 115.0, num_envs)
         return measured(100.0 if (gmis_per_gpu, num_envs) == (4, 2048) else 1.0, num_envs)
 
-    seen = points(search(PAPER, profile, COARSE._replace(tolerance=0.0)))
+    seen = points(search(PAPER, profile, RULES))
     assert (5, 1024) in seen
     assert max(n for k, n in seen if k == 5) == 4096
 
@@ -199,37 +211,25 @@ def test_smaller_sizes_are_looked_at_when_no_larger_one_runs():
             return NotRunnable("out of memory")
         return measured(100.0 * point.num_envs, point.num_envs)
 
-    assert best(search(PAPER, profile, COARSE)).point.num_envs == 512
+    assert best(search(PAPER, profile, RULES)).point.num_envs == 512
 
 
-def test_rows_differ_in_trainers_too():
-    """A row has a number of agents and of trainers: Sat compares sizes of the same row only."""
-
-    def profile(point: Point) -> Measured:
-        return measured(point.num_envs / point.trainers, 100.0 * point.num_envs)
-
-    grid = Grid((2, 1), (1, 2), ("jax",), trainers=(1, 3))
-    outcome = search(grid, profile, AS_PRINTED)
-    assert len(outcome.visited) == 8
-    assert [one.saturation for one in outcome.visited] == [None, 1.0] * 4
-    assert best(outcome).point == Point(2, 2, "jax", 1)
-    assert str(best(outcome).point) == "2 + 1 x 2, jax"
+def test_a_point_with_trainers_names_both_numbers():
+    assert str(Point(2, 2, "jax", 1)) == "2 + 1 x 2, jax"
     assert str(Point(2, 2, "jax")) == "2 x 2, jax"
-    # Of equals the one with the fewest GMIs wins, trainers included.
-    equal = search(grid, lambda point: measured(100.0 / point.gmis_per_gpu), AS_PRINTED)
-    assert best(equal).point == Point(1, 1, "jax", 1)
 
 
 def test_sat_goes_by_what_the_job_gains():
     """Here trainers learn no faster from more, but agents make more, so fewer must act."""
 
     def profile(point: Point) -> Measured:
-        return measured(100.0, point.num_envs, acting_per_s=100.0 * point.num_envs)
+        rate = 100.0 if point.num_envs == 1 else 150.0
+        return measured(rate, point.num_envs, acting_per_s=100.0 * point.num_envs)
 
-    grid = Grid((1,), (1, 2, 4), ("jax",), trainers=(1,))
-    assert len(search(grid, profile, AS_PRINTED).visited) == 2
-    whole = search(grid, profile, AS_PRINTED._replace(top=lambda one: one.acting_per_s))
-    assert [one.saturation for one in whole.visited] == [None, 1.0, 1.0]
+    grid = Grid((1,), (1, 2, 4, 8), ("jax",), trainers=1)
+    assert len(algorithm2.search(grid, profile, RULES).visited) == 3
+    whole = algorithm2.search(grid, profile, RULES._replace(top=lambda one: one.acting_per_s))
+    assert [one.saturation for one in whole.visited] == [None, 1.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(("factor", "rows"), [(2.0, {1}), (1.05, {1, 4, 7, 10})])
@@ -241,7 +241,7 @@ def test_an_implementation_that_is_clearly_slower_is_left_after_the_first_row(
         faster = factor if point.impl == "warp" else 1.0
         return one._replace(env_steps_per_s=faster * one.env_steps_per_s)
 
-    outcome = search(PAPER._replace(impls=("jax", "warp")), profile, COARSE)
+    outcome = search(PAPER._replace(impls=("jax", "warp")), profile, RULES)
     assert best(outcome).point.impl == "warp"
     assert {p.point.gmis_per_gpu for p in outcome.visited if p.point.impl == "jax"} == rows
 
@@ -257,7 +257,6 @@ def test_points_of_an_h200_give_the_same_answer_with_fewer_profiles():
         row = known[point]
         return measured(row["env_steps_per_s"], row["memory_mib"])
 
-    rules = COARSE._replace(alpha=rows["search"]["alpha"], tolerance=rows["search"]["tolerance"])
-    outcome = search(PAPER._replace(impls=("jax", "warp")), profile, rules)
+    outcome = search(PAPER._replace(impls=("jax", "warp")), profile, RULES)
     assert best(outcome).point == Point(7, 16384, "warp")
     assert len(outcome.visited) == len(known) - 6

@@ -27,8 +27,8 @@ from gmijax.errors import ConfigError, JobInterrupted
 from gmijax.machine.host_limits import HostLimits
 from gmijax.machine.snapshot import Machine
 
-Answer = Callable[[Point, str], Measured | NotRunnable]
-GRID = ("search.gmis_per_gpu=[4,2,1]", "search.num_envs=[64,128]", "search.order=as_printed")
+Answer = Callable[[Point], Measured | NotRunnable]
+GRID = ("search.gmis_per_gpu=[4,2,1]", "search.num_envs=[64,128]")
 MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 
 
@@ -37,19 +37,19 @@ class Profiles:
 
     def __init__(self, answer: Answer) -> None:
         self.answer = answer
-        self.asked: list[tuple[Point, str]] = []
+        self.asked: list[Point] = []
 
     def __call__(
-        self, workload: Workload[Any], point: Point, mode: str, *_: Any, **__: Any
+        self, workload: Workload[Any], point: Point, *_: Any, **__: Any
     ) -> Measured | NotRunnable:
         assert workload.kind.module == "gmijax.workers.training_worker"
-        self.asked.append((point, mode))
-        return self.answer(point, mode)
+        self.asked.append(point)
+        return self.answer(point)
 
 
-def scaling(point: Point, mode: str) -> Measured:
+def scaling(point: Point) -> Measured:
     """Twice the throughput with twice the environments; GMIs of a GPU cost each other 10 %."""
-    contention = 0.9 if mode == "corun" and point.gmis_per_gpu > 1 else 1.0
+    contention = 0.9 if point.gmis_per_gpu > 1 else 1.0
     return Measured(contention * 1000.0 * point.num_envs, 100.0 + point.num_envs, 0.1)
 
 
@@ -86,7 +86,7 @@ def test_a_second_search_profiles_nothing(profiles: Use, monkeypatch: pytest.Mon
     monkeypatch.setattr(tuner, "draw", draw)
     result, said = found()
     assert (result.gmis_per_gpu, result.num_envs, result.impl) == (4, 128, "jax")
-    assert len(first.asked) == 6
+    assert len(first.asked) == 4
     assert result.run_dir
     assert result.reason in said
     assert "3.60 times the best with one GMI" in result.reason
@@ -97,7 +97,7 @@ def test_a_second_search_profiles_nothing(profiles: Use, monkeypatch: pytest.Mon
         "impl": "jax",
         "projected": pytest.approx(4 * 0.9 * 128_000),
     }
-    assert (report["complete"], report["num_profiled"]) == (True, 6)
+    assert (report["complete"], report["num_profiled"]) == (True, 4)
     assert (result.run_dir / "search.png").stat().st_size > 1000
     again = profiles(scaling)
     second, _ = found()
@@ -107,10 +107,10 @@ def test_a_second_search_profiles_nothing(profiles: Use, monkeypatch: pytest.Mon
 
 
 def test_an_interrupted_search_goes_on_where_it_was(profiles: Use):
-    def interrupted(point: Point, mode: str) -> Measured:
+    def interrupted(point: Point) -> Measured:
         if point == Point(2, 128, "jax"):
             raise JobInterrupted("stopped")
-        return scaling(point, mode)
+        return scaling(point)
 
     first = profiles(interrupted)
     with pytest.raises(JobInterrupted) as stopped:
@@ -119,21 +119,21 @@ def test_an_interrupted_search_goes_on_where_it_was(profiles: Use):
     rest = profiles(scaling)
     result, _ = found()
     assert rest.asked[0] == first.asked[-1]
-    assert len(first.asked) - 1 + len(rest.asked) == 6
+    assert len(first.asked) - 1 + len(rest.asked) == 4
     assert result.num_envs == 128
 
 
 def test_what_cannot_run_is_told_and_remembered(profiles: Use):
     reason = "cannot run on layout [[0,1]]: see [/tmp/x]"  # It may look like markup.
 
-    def small(point: Point, mode: str) -> Measured | NotRunnable:
-        return NotRunnable(reason) if point.gmis_per_gpu == 4 else scaling(point, mode)
+    def small(point: Point) -> Measured | NotRunnable:
+        return NotRunnable(reason) if point.gmis_per_gpu == 4 else scaling(point)
 
     profiles(small)
     result, said = found()
     assert result.gmis_per_gpu == 2
-    assert f"4 x 64, jax (corun): not runnable: {reason}" in said
-    assert said.count(reason) == 4  # Two points, each when it is profiled and in the table.
+    assert f"4 x 128, jax: not runnable: {reason}" in said
+    assert said.count(reason) == 2  # When it is profiled, and in the table.
     assert profiles(scaling).asked == []
     assert found()[0].gmis_per_gpu == 2
 
@@ -145,78 +145,81 @@ def test_points_for_which_the_host_is_too_small_are_told_and_not_started(
     asked = profiles(scaling)
     result, said = found(here=few)
     assert result.gmis_per_gpu == 2
-    assert all(point.gmis_per_gpu < 4 for point, _ in asked.asked)
-    assert "4 x 64, jax (corun): not runnable: plan.gmis_per_gpu=4: 4 GMIs on this" in said
+    assert all(point.gmis_per_gpu < 4 for point in asked.asked)
+    assert "4 x 128, jax: not runnable: plan.gmis_per_gpu=4: 4 GMIs on this" in said
     # With more room they are measured: they were not remembered as what cannot run.
     again = profiles(scaling)
     assert found()[0].gmis_per_gpu == 4
-    assert {point.gmis_per_gpu for point, _ in again.asked} == {4}
+    assert {point.gmis_per_gpu for point in again.asked} == {4}
     with pytest.raises(ConfigError, match=r"^plan\.gmis_per_gpu=64: 64 GMIs .* are at most 2$"):
         found("plan.gmis_per_gpu=64", here=few)
 
 
 def test_a_profile_that_hangs_cannot_run(profiles: Use):
-    def late(point: Point, mode: str) -> Measured:
+    def late(point: Point) -> Measured:
         if point.num_envs == 128:
             raise ProfileLate("no end within 5 s (GMI 0 compiling)")
-        return scaling(point, mode)
+        return scaling(point)
 
     profiles(late)
-    result, _ = found("search.profile_timeout_s=5")
+    result, _ = found("search.budget_s=20")
     assert result.num_envs == 64
     reasons = [point.get("reason") for point in result.report["points"]]
-    assert reasons.count("no end within 5 s (GMI 0 compiling)") == 3
+    assert reasons.count("no end within 5 s (GMI 0 compiling)") == 2
     again = profiles(scaling)
-    assert found("search.profile_timeout_s=5")[0].num_envs == 64
+    assert found("search.budget_s=20")[0].num_envs == 64
     assert again.asked == []
-    assert found("search.profile_timeout_s=6")[0].num_envs == 128  # More time than they had.
-    assert {point.num_envs for point, _ in again.asked} == {128}
+    assert found("search.budget_s=30")[0].num_envs == 128  # More time than they had.
+    assert {point.num_envs for point in again.asked} == {128}
 
 
-def test_a_profile_cut_off_by_the_budget_is_no_answer(profiles: Use):
-    def slow(point: Point, mode: str) -> Measured:
-        if point != Point(4, 64, "jax"):
+def test_a_profile_cut_off_by_the_budget_is_no_answer(
+    profiles: Use, monkeypatch: pytest.MonkeyPatch
+):
+    clock = [0.0]
+    monkeypatch.setattr(tuner, "running_s", lambda: clock[0])
+
+    def slow(point: Point) -> Measured:
+        clock[0] += 12.0
+        if point != Point(1, 128, "jax"):
             raise ProfileLate("cut off")
-        return scaling(point, mode)
+        return scaling(point)
 
     profiles(slow)
-    result, _ = found("search.budget_s=20", "search.profile_timeout_s=30")
-    assert (result.gmis_per_gpu, result.num_envs) == (4, 64)
+    result, _ = found("search.budget_s=20")
+    assert (result.gmis_per_gpu, result.num_envs) == (1, 128)
     assert not result.report["complete"]
     assert "the budget ended the search after 1 points" in result.reason
-    with pytest.raises(ConfigError, match=r"^search\.budget_s=10: too small for one profile"):
-        found("search.budget_s=10", "search.num_envs=[128]")
     rest = profiles(scaling)
     found()
-    assert rest.asked[0] == (Point(4, 128, "jax"), "corun")
+    assert rest.asked[0] == Point(4, 128, "jax")
+
+
+def test_the_order_of_the_paper_goes_through_the_whole_grid(profiles: Use):
+    asked = profiles(scaling).asked
+    result, _ = found("search.order=as_printed")
+    assert [(point.gmis_per_gpu, point.num_envs) for point in asked] == [
+        *((4, 64), (4, 128), (2, 64), (2, 128), (1, 64), (1, 128))
+    ]
+    assert (result.gmis_per_gpu, result.num_envs) == (4, 128)
+    with pytest.raises(ConfigError, match=r"^search\.order=as_printed: no point is a candidate"):
+        found("search.order=as_printed", "search.num_envs=[64]")
 
 
 def test_what_is_given_is_not_searched(profiles: Use):
     asked = profiles(scaling).asked
     assert found("plan.gmis_per_gpu=3")[0].gmis_per_gpu == 3
-    assert {point.gmis_per_gpu for point, _ in asked} == {3}
+    assert {point.gmis_per_gpu for point in asked} == {3}
     asked = profiles(scaling).asked
     assert found("num_envs=96", "plan.layout=[[0,1],[2]]")[0].gmis_per_gpu == 2
-    assert [point for point, _ in asked] == [Point(2, 96, "jax")]
-
-
-def test_both_modes_tell_how_far_they_differ(profiles: Use):
-    asked = profiles(scaling).asked
-    result, said = found("search.mode=both")
-    modes = [mode for _, mode in asked]
-    assert modes == ["corun"] * 6 + ["isolated"] * 4  # One GMI is the same in both.
-    assert "corun/isolated" in said
-    ratios = {
-        point["gmis_per_gpu"]: point["corun_over_isolated"] for point in result.report["points"]
-    }
-    assert ratios == {4: pytest.approx(0.9), 2: pytest.approx(0.9), 1: None}
+    assert asked == [Point(2, 96, "jax")]
 
 
 def test_one_gmi_is_said_plainly(profiles: Use):
-    profiles(lambda point, _: Measured(1e6 / point.gmis_per_gpu, 100.0 + point.num_envs, 0.1))
+    profiles(lambda point: Measured(1e6 / point.gmis_per_gpu, 100.0 + point.num_envs, 0.1))
     result, _ = found()
     assert (result.gmis_per_gpu, result.num_envs) == (1, 64)
-    assert "one GMI is enough here: the best with several, 4 x 64, jax, makes 1.00" in (
+    assert "one GMI is enough here: the best with several, 4 x 128, jax, makes 1.00" in (
         result.reason
     )
 
@@ -231,24 +234,6 @@ def test_a_job_with_too_few_gpus_is_refused_before_anything_is_profiled(
     given = compose("num_envs=64")
     assert with_auto_decided(given, machine(0), Console(quiet=True)) == (given, ())
     assert asked.asked == []
-
-
-def test_isolated_is_one_gmi_of_those_that_corun():
-    workload = PpoWorkload(wanted("plan.gpus=2"))
-    here = machine(0, cpu_cores=(0, 1, 2, 3))
-    together = workload.plan_at(Point(2, 64, "jax"), "corun", here)
-    alone = workload.plan_at(Point(2, 64, "jax"), "isolated", here)
-    assert (together.layout.num_gmis, alone.layout.num_gmis) == (2, 1)
-    assert together.strategy != alone.strategy == "none"
-    assert alone.slices == together.slices[:1]
-    assert alone.slices[0].cpus == (0, 1)
-    # On a GPU it has an even share of SMs and memory.
-    here = machine(2, mps_control=MPS)
-    together = workload.plan_at(Point(4, 64, "jax"), "corun", here)
-    (share,) = workload.plan_at(Point(4, 64, "jax"), "isolated", here).slices
-    assert together.layout.num_gpus == 1
-    assert [one.sm_percent for one in together.slices] == [None] * 4
-    assert (share.sm_percent, share.memory_fraction) == (25.0, 0.2)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
-"""Main of a GMI that does nothing but reduce: `python -m gmijax.workers.reduction_probe`.
+"""Main of a GMI that does nothing but reduce: `python -m benchmarks.reduction_probe`.
 
 One process measures all strategies and sizes one after the other, because starting is most of
-what a measurement costs. `gmijax.control.strategy_selection` starts it.
+what a measurement costs. `benchmarks.reduction_jobs` starts it.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.reduction_jobs import CHAIN, TIMEOUT_S, block_variable
 from gmijax.collectives.communicator import CommunicatorConfig, make_communicator
 from gmijax.collectives.interface import Collectives, Communicator
-from gmijax.control.strategy_selection import CHAIN, TIMEOUT_S, block_variable
 from gmijax.errors import DeviceMemoryUnavailable
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import read_json

@@ -1,0 +1,1 @@
+"""What the paper has and only comparisons with it need; chosen by name, imported when chosen."""
