@@ -27,9 +27,9 @@ from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.supervise.job_kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
 
 if TYPE_CHECKING:
+    from gmijax.baselines.tdg_ex import RemoteIteration
     from gmijax.collectives.interface import Communicator
     from gmijax.learning.learner import Learner
-    from gmijax.ppo.tdg_ex import RemoteIteration
     from gmijax.sim.wrappers import BatchedEnv
 
 
@@ -103,9 +103,9 @@ def _remote_iteration(
     held: ExitStack,
 ) -> tuple[RemoteIteration, int]:
     """An iteration on rollouts of other GMIs, and how many these are."""
+    from gmijax.baselines.tdg_ex import RemoteIteration, RolloutWorkers
     from gmijax.channels.messenger import Messenger
     from gmijax.channels.pipe_block import PipeBlock
-    from gmijax.ppo.tdg_ex import RemoteIteration, RolloutWorkers
 
     block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
     held.callback(block.close)
@@ -124,12 +124,12 @@ def _serve_rollouts(
     held: ExitStack,
 ) -> dict[str, Any]:
     """Makes rollouts for the trainer on the same GPU."""
+    from gmijax.baselines.tdg_ex import serve_rollouts
     from gmijax.channels.messenger import Messenger
     from gmijax.channels.pipe_block import PipeBlock
     from gmijax.config import PpoConfig
     from gmijax.learning.learner import make_learner
     from gmijax.learning.start import first_envs
-    from gmijax.ppo.tdg_ex import serve_rollouts
 
     assert isinstance(config.algo, PpoConfig)
     block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)

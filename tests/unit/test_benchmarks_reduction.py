@@ -22,6 +22,6 @@ from gmijax.partition import reduction
 def test_everything_that_can_run_is_measured_once(
     changes: dict[str, Any], names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    monkeypatch.setattr(reduction, "is_installed", lambda *_: True)
     plan = planned(machine(2, mps_control=MPS), **changes)
     assert [probe.name for probe in candidates(plan, 100)] == names
