@@ -58,7 +58,9 @@ class Benchmark:
 
     def run(self, ways: Sequence[Way]) -> bool:
         """Whether there was time for all."""
-        with ThreadPoolExecutor(self._free.count if self._free else 1) as pool:
+        if self._free is None:  # In this thread, which signals interrupt.
+            return all([self._repeat(number, ways) for number in range(self._given.repeats)])
+        with ThreadPoolExecutor(self._free.count) as pool:
             return all([*pool.map(lambda n: self._repeat(n, ways), range(self._given.repeats))])
 
     def _repeat(self, number: int, ways: Sequence[Way]) -> bool:

@@ -103,7 +103,11 @@ def run_all(turns: Sequence[_Turn], free: FreeGpus | None) -> None:
         with free.taken(turn.case.gpus) if free else nullcontext(()) as gpus:
             turn.run((f"plan.gpus=[{','.join(map(str, gpus))}]",) if free else ())
 
-    with ThreadPoolExecutor(free.count if free else 1) as pool:
+    if free is None:  # In this thread, which signals interrupt.
+        for turn in turns:
+            run(turn)
+        return
+    with ThreadPoolExecutor(free.count) as pool:
         started = [pool.submit(run, turn) for turn in turns]
         try:
             for one in started:

@@ -95,10 +95,16 @@ def train(given: argparse.Namespace, root: Path, file: ResultsFile) -> int:
     configs = [compose(*overrides(task, given), f"run.dir={root}") for task in given.tasks]
     # All save and end then. A sweep that has failed jobs has run the others.
     alarm = threading.Timer(given.deadline_s - STOP_S, os.kill, (os.getpid(), signal.SIGTERM))
+    alarm.daemon = True
     alarm.start()
-    with suppress(JobInterrupted, SweepFailed):
-        sweep(configs, jobs_per_gpu=PLACES, gpus=1)
-    alarm.cancel()
+    try:
+        with suppress(JobInterrupted, SweepFailed):
+            sweep(configs, jobs_per_gpu=PLACES, gpus=1)
+    finally:
+        alarm.cancel()
+    if not (root / "sweep.json").exists():
+        sys.stdout.write("the deadline came before the trainings had begun\n")
+        return 1
     code = 0
     for task, job in zip(given.tasks, read_json(root / "sweep.json")["jobs"], strict=True):
         if job["state"] in CODES:

@@ -22,9 +22,9 @@ from gmijax.autotune.search import Outcome, OutOfBudget, Rules, Visited
 from gmijax.autotune.store import ProfileStore
 from gmijax.autotune.workloads import (
     C,
-    PpoWorkload,
     ServeWorkload,
     Split,
+    SynchronousWorkload,
     Workload,
     installed_versions,
 )
@@ -78,7 +78,7 @@ def workload_of(config: TrainConfig | ServeConfig) -> Workload[Any]:
     """A job as a workload; raises ConfigError for one that cannot be profiled."""
     if isinstance(config, ServeConfig):
         return ServeWorkload(config)
-    return A3cWorkload(config) if config.is_decoupled else PpoWorkload(config)
+    return A3cWorkload(config) if config.is_decoupled else SynchronousWorkload(config)
 
 
 def is_auto(config: TrainConfig | ServeConfig) -> bool:

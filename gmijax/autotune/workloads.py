@@ -165,7 +165,7 @@ class Workload(ABC, Generic[C]):
         }
 
 
-class PpoWorkload(Workload[TrainConfig]):
+class SynchronousWorkload(Workload[TrainConfig]):
     """Synchronous training."""
 
     template = "tcg_ex"

@@ -190,6 +190,11 @@ class DeviceBuffers(SentArrays):
         """A copy of an array, which may be overwritten on return; CudaError as `view`."""
         return jnp.copy(self._received.view(buffered)).block_until_ready()
 
+    def close(self) -> None:
+        """Gives the block and the mappings back."""
+        self._received.close()
+        super().close()
+
     def _is_made(self) -> bool:
         if self._is_usable:
             try:

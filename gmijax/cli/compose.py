@@ -184,8 +184,8 @@ def _check_override(name: str, item: Override) -> None:
     if options and item.is_delete() and not isinstance(item.value(), str | None):
         raise ConfigError(f"{item.input_line}: expected ~{key}")
     if options and not item.is_delete() and item.value() not in options:
-        # Of two or three the closest name is a guess: `algo=sac` is no slip for a3c.
-        few = f": allowed are {', '.join(options)}" if len(options) < 4 else ""
+        # Of a few the closest name is a guess: `algo=td3` is no slip for a3c.
+        few = f": allowed are {', '.join(options)}" if len(options) < 5 else ""
         raise ConfigError(
             f"{key}={item.value()}: unknown{few or suggestion(str(item.value()), options)}"
         )

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from pathlib import Path
+from typing import ClassVar, Literal, NamedTuple, Self
 
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
@@ -106,6 +109,14 @@ class PolicyConfig(KeyGroup):
     def kept_steps(self) -> int:
         """Steps of every environment whose experience is in memory at once."""
         return self.unroll_length
+
+    def with_checkpoints(self, find: Callable[[str, str], Path]) -> Self:
+        """This configuration with what it takes from other runs as paths of checkpoints.
+
+        `find` is given what the user wrote and the key: `gmijax.runs.resume.find_checkpoint`.
+        """
+        del find
+        return self
 
     def check_job(self, num_envs: int | None, template: str) -> None:
         """Checks what depends on other keys too; `num_envs` is None where it is not decided yet.
@@ -337,8 +348,13 @@ class DistillConfig(RolloutConfig):
             )
         super().check_job(num_envs, template)
 
+    def with_checkpoints(self, find: Callable[[str, str], Path]) -> Self:
+        """See `PolicyConfig`."""
+        assert self.teacher is not None
+        return dataclasses.replace(self, teacher=str(find(self.teacher, "algo.teacher")))
 
-_WIDEST_STD = 0.48
+
+_WIDEST_STD = 0.479
 """Entropy behind a tanh is at most 0.684 nats an action, that of a Gaussian this wide."""
 
 
@@ -355,7 +371,9 @@ class SacConfig(PolicyConfig):
         "factor on rewards before learning (logged returns are unscaled)", positive=True
     )
     batch_size: int = doc("transitions in one update of one GMI, drawn from its replay", low=1)
-    updates_per_step: int = doc("updates of the critics for every step of all environments", low=1)
+    updates_per_step: int = doc(
+        "updates of the critics after every step of all environments of a GMI", low=1
+    )
     policy_every: int = doc("updates of the critics for every one of the policy", low=1)
     replay_steps: int = doc(
         "steps of every environment that the replay holds, a multiple of unroll_length", low=2
@@ -409,6 +427,7 @@ class SacConfig(PolicyConfig):
                 "tanh_normal",
             ),
             ("preserve_outputs", self.preserve_outputs, self.preserve_outputs, "false"),
+            ("target_rate", self.target_rate, self.target_rate > 1.0, "at most 1"),
             (
                 *("batch_size", self.batch_size),
                 self.batch_size > fewest,

@@ -43,7 +43,12 @@ from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
 from gmijax.runs.git import record_git
 from gmijax.runs.held import OpenFolder, is_locked, locked
 from gmijax.runs.history import MetricsReader, copy_history, draw_returns, read_metrics
-from gmijax.runs.resume import CheckpointMeta, checkpoints_of, drop_unfinished
+from gmijax.runs.resume import (
+    CheckpointMeta,
+    checkpoints_of,
+    drop_unfinished,
+    find_checkpoint,
+)
 from gmijax.runs.saved_config import saved_config
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import training_kind
@@ -275,9 +280,17 @@ def record_end(
 
 
 def started_from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
-    """The configuration with `run.resume` as the path of a checkpoint, or null."""
+    """The configuration with `run.resume` as the path of a checkpoint, or null.
+
+    What else it takes from other runs is the path of a checkpoint from then on too, so that all
+    GMIs, restarts and resumed runs take the same.
+
+    Raises:
+      ConfigError: there is no such checkpoint.
+    """
     resume = None if checkpoint is None else str(checkpoint)
-    return dataclasses.replace(config, run=dataclasses.replace(config.run, resume=resume))
+    run = dataclasses.replace(config.run, resume=resume)
+    return dataclasses.replace(config, run=run, algo=config.algo.with_checkpoints(find_checkpoint))
 
 
 def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:

@@ -16,7 +16,7 @@ import jax
 
 from gmijax.collectives.interface import Collectives
 from gmijax.config import AlgoConfig
-from gmijax.learning.learner import Learner, init_learner
+from gmijax.learning.learner import Learner, LearnerState, init_learner
 from gmijax.learning.unroll import Counts
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState
@@ -71,6 +71,10 @@ def _itself(memory: Any) -> BatchState:
     return memory
 
 
+def _params(state: LearnerState) -> PyTree:
+    return state.params
+
+
 @dataclass(frozen=True)
 class Algorithm:
     """An algorithm for jobs in which every GMI simulates, acts and trains.
@@ -83,6 +87,7 @@ class Algorithm:
       begin: `(learner, env, environments at their starts)` to the first memory of a GMI; by
         default the environments.
       envs: the environments in a memory, which checkpoints hold.
+      learned: all weights in a state, which have to be finite, and equal on all GMIs.
     """
 
     make_learner: Callable[[EnvSpec, Any], Learner[Any]]
@@ -91,10 +96,11 @@ class Algorithm:
     num_averaged: Callable[[EnvSpec, Any], int]
     begin: Callable[[Learner[Any], BatchedEnv, BatchState], Any] = _environments
     envs: Callable[[Any], BatchState] = _itself
+    learned: Callable[[Any], PyTree] = _params
 
 
 def load_algorithm(config: AlgoConfig) -> Algorithm:
-    """The algorithm that a configuration is of; see `ActorCriticConfig.implementation`."""
+    """The algorithm that a configuration is of; see `PolicyConfig.implementation`."""
     module, name = config.implementation.split(":")
     return getattr(import_module(module), name)
 

@@ -1,7 +1,7 @@
 """Distributions of actions: what the output of a policy's network means.
 
 A new one is a subclass of `Normal`, of which it keeps what fits, and an entry in `DISTRIBUTIONS`;
-its name goes into `ActorCriticConfig.distribution_type`.
+its name goes into `PolicyConfig.distribution_type`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Networks, optimiser and the learner's state: what all training algorithms share.
 
-Checkpoints hold a `TrainState` whatever the algorithm, so that all can be played.
+Checkpoints hold a state of the algorithm (`LearnerState`), all of which can be played.
 """
 
 from __future__ import annotations

@@ -253,11 +253,14 @@ class TrainingLoop:
         """Begins to write a checkpoint of every run; training goes on meanwhile."""
         self._iteration.wait()
         thread.wait()  # A resumed run goes on from the lines up to its checkpoint.
-        require_equal(self._comm, self._link.gmi, state.params, self._env_steps)
+        self._saver.finish()  # Two copies on the host at once may be too much.
+        learned = self._algorithm.learned(state)
+        require_equal(self._comm, self._link.gmi, learned, self._env_steps)
         parts = self._members.parts(
             self._env_steps,
             self._comm.world_size,
             state,
+            learned,
             None if self._remote else self._algorithm.envs(memory),
             evaluation,
             is_leader=self._is_leader,

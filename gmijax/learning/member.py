@@ -134,22 +134,25 @@ class Members:
         env_steps: int,
         num_gmis: int,
         state: TrainState,
+        learned: PyTree,
         env_state: PyTree | None,
         evaluation: Evaluation | None,
         *,
         is_leader: bool,
     ) -> list[Part]:
-        """What a checkpoint holds of each run whose parameters are finite; both may be donated."""
-        if self.is_one:
-            require_finite(state.params, self.first.config.env.label, env_steps)
+        """What a checkpoint holds of each run whose weights, `learned`, are finite.
+
+        All arguments may be donated afterwards.
+        """
+        learned = jax.device_get(learned)
         learners = on_host(state) if is_leader else None
         envs = None if env_state is None else on_host(env_state)
         parts = []
         for number, member in enumerate(self._members):
-            own, own_envs = (learners, envs) if self.is_one else _row((learners, envs), number)
-            if own is not None and not self.is_one:
-                name = member.config.env.label
-                self._try(member, partial(require_finite, own.params, name, env_steps))
+            (own, own_envs), weights = (learners, envs), learned
+            if not self.is_one:
+                (own, own_envs), weights = _row(((learners, envs), learned), number)
+            self._try(member, partial(require_finite, weights, member.config.env.label, env_steps))
             if member.error is None:
                 parts.append(member.part(env_steps, num_gmis, own, own_envs, evaluation))
         return parts

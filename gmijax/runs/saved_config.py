@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig, TrainConfig
-from gmijax.config.removed import without_removed
+from gmijax.config.removed import REMOVED, without_removed
 from gmijax.config.schema import flatten, from_dict, from_named, known
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
@@ -72,10 +72,11 @@ def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
     To train on without them would be another training. Policies act without, see `trained_config`.
     """
     if unknown := _unknown_keys(saved):
+        write = [f"{key}: {REMOVED[key].write}" for key in flatten(saved) if key in REMOVED]
         raise ConfigError(
             f"{what}: its config.json has keys that this version does not know: {unknown}; take "
             "them out of that file to go on without them (the policy can be played, exported and "
-            "served as it is)"
+            f"served as it is){''.join(f'; {line}' for line in write)}"
         )
 
 

@@ -14,9 +14,6 @@ from gmijax.types import Array, PRNGKey, PyTree
 
 NUM_CRITICS = 2
 
-_LEAST_LOG_PROB = -30.0
-"""Below it a probability counts as this: 0 x -inf is not a number."""
-
 
 class _Critic(nn.Module):
     """Layer norm and SiLU behind every hidden layer, as FastSAC has them."""
@@ -54,7 +51,7 @@ class Critics(NamedTuple):
         """Logarithms of probabilities [2, B, Z] of the atoms."""
         inputs = jnp.concatenate([obs, action], axis=-1)
         logits: Any = jax.vmap(self.network.apply, in_axes=(0, None))(params, inputs)
-        return jnp.maximum(jax.nn.log_softmax(logits), _LEAST_LOG_PROB)
+        return jax.nn.log_softmax(logits)
 
     def values(self, params: PyTree, obs: Array, action: Array) -> Array:
         """Mean returns [2, B]."""

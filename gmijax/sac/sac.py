@@ -1,4 +1,4 @@
-"""An iteration of SAC: T steps into the replay, then updates on batches drawn from it.
+"""An iteration of SAC: T times a step into the replay and updates on batches drawn from it.
 
 Agents and learner take turns in one program. Where several GMIs train, each has its own
 environments and its own replay, and they average the gradients of their batches.
@@ -163,33 +163,52 @@ def iterate(
     state: SacState,
     memory: Memory,
 ) -> tuple[SacState, Memory, IterationMetrics]:
-    """See `gmijax.learning.algorithm.Iterate`."""
+    """See `gmijax.learning.algorithm.Iterate`: T rounds of a step and its updates."""
     config = learner.config
-    memory, stats = _rollout(env, learner, model, state, memory)
-    everyone = collectives.all_gather(stats)
-    counts = jax.tree.map(lambda x: jnp.sum(x, axis=0), everyone.counts)
     key = jax.random.fold_in(jax.random.fold_in(state.key, state.iteration), collectives.rank())
-    keys = jax.random.split(key, config.updates_per_step * config.unroll_length)
-    update = partial(_update, learner, collectives, memory.replay, everyone)
-    learnt, losses = jax.lax.scan(update, state, keys)
-    # The same on all GMIs, whose replays fill alike. Before, there is too little to learn from.
-    is_ready = memory.replay.filled >= config.learning_starts
-    state = jax.tree.map(lambda new, old: jnp.where(is_ready, new, old), learnt, state)
+    keys = jax.random.split(key, config.unroll_length)
+    one_round = partial(_round, env, learner, collectives, model)
+    (state, memory), (stats, losses, is_due) = jax.lax.scan(one_round, (state, memory), keys)
+    own = _Stats(merge_all(stats.obs), jax.tree.map(lambda x: jnp.sum(x, axis=0), stats.counts))
+    everyone = collectives.all_gather(own, after=losses)
+    counts = jax.tree.map(lambda x: jnp.sum(x, axis=0), everyone.counts)
     state = finish_iteration(learner, state, merge_all(everyone.obs))
     figures = {
         **policy_figures(state),
         "policy/temperature": jnp.exp(state.log_temperature),
         "replay/steps": memory.replay.filled.astype(jnp.float32),
     }
-    means = jax.tree.map(lambda x: jnp.where(is_ready, jnp.mean(x), 0.0), losses)
-    means = means._replace(policy_loss=config.policy_every * means.policy_loss)
+    means = jax.tree.map(jnp.mean, losses)
+    of_policy = jnp.sum(losses.policy_loss) / jnp.maximum(jnp.sum(is_due), 1.0)
+    means = means._replace(policy_loss=of_policy)
     return state, memory, IterationMetrics(counts, means, figures, {})
 
 
-def _rollout(
+def _round(
+    env: BatchedEnv,
+    learner: SacLearner,
+    collectives: Collectives,
+    model: PyTree,
+    before: tuple[SacState, Memory],
+    key: PRNGKey,
+) -> tuple[tuple[SacState, Memory], tuple[_Stats, SacLosses, Array]]:
+    """A step of all environments, and the updates after it."""
+    config, (state, memory) = learner.config, before
+    memory, stats = _act(env, learner, model, state, memory)
+    update = partial(_update, learner, collectives, memory.replay)
+    keys = jax.random.split(key, config.updates_per_step)
+    after, (losses, is_due) = jax.lax.scan(update, state, keys)
+    # The same on all GMIs, whose replays fill alike. Before, there is too little to learn from.
+    is_ready = memory.replay.filled >= config.learning_starts
+    state = jax.tree.map(lambda new, old: jnp.where(is_ready, new, old), after, state)
+    losses = jax.tree.map(lambda x: jnp.where(is_ready, x, 0.0), losses)
+    return (state, memory), (stats, losses, is_due & is_ready)
+
+
+def _act(
     env: BatchedEnv, learner: SacLearner, model: PyTree, state: SacState, memory: Memory
 ) -> tuple[Memory, _Stats]:
-    """T steps of this GMI's environments, into its replay."""
+    """A step of this GMI's environments, into its replay."""
     weights = acting_weights(learner, state)
 
     def keep(before: BatchState, drawn: Any, action: Array, out: StepOutput) -> Any:
@@ -200,7 +219,7 @@ def _rollout(
     envs, (obs, action, reward, kind, outcomes) = unroll(
         env,
         partial(act, learner.networks, weights),
-        learner.config.unroll_length,
+        1,
         keep,
         model,
         memory.envs,
@@ -215,17 +234,20 @@ def _update(
     learner: SacLearner,
     collectives: Collectives,
     replay: Replay,
-    after: Any,
     state: SacState,
     key: PRNGKey,
-) -> tuple[SacState, SacLosses]:
-    """One update of the critics and the temperature, and of the policy if it is its turn."""
+) -> tuple[SacState, tuple[SacLosses, Array]]:
+    """One update of the critics and the temperature, and of the policy if it is its turn.
+
+    Returns also whether it was. Where several runs share a program the gradient of the policy is
+    computed in every update, and used when it is its turn.
+    """
     config, critics = learner.config, critics_of(learner.config)
     batch_key, next_key, policy_key = jax.random.split(key, 3)
     batch = _batch(learner, state, replay, batch_key)
     is_due = state.updates % config.policy_every == 0
     own = _gradients(learner, critics, state, batch, is_due, next_key, policy_key)
-    (critic_grads, policy_grads, temperature_grad), losses = collectives.mean(own, after=after)
+    (critic_grads, policy_grads, temperature_grad), losses = collectives.mean(own)
     optimizers = _optimizers(config)
     new_critics, critic_opt = _step(
         optimizers[0], state, state.opt_states[0], critic_grads, state.critics
@@ -252,7 +274,7 @@ def _update(
         log_temperature=new_temperature,
         updates=state.updates + 1,
     )
-    return state, losses
+    return state, (losses, is_due)
 
 
 def _batch(learner: SacLearner, state: SacState, replay: Replay, key: PRNGKey) -> Batch:
@@ -346,4 +368,5 @@ SAC = Algorithm(
     num_averaged=_num_averaged,
     begin=begin,
     envs=lambda memory: memory.envs,
+    learned=lambda state: (state.params, state.critics, state.targets, state.log_temperature),
 )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import atexit
 import faulthandler
 import gc
+import io
 import os
 import signal
 import sys
@@ -40,6 +41,9 @@ END_BYTE: Final = b"e"
 
 LEFT_TO_CONTROLLER: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
 """Signals that a GMI with a lifeline ignores."""
+
+_WRITERS: Final = (io.TextIOWrapper, io.BufferedWriter, io.BufferedRandom)
+"""Files that a role or a task may have left open."""
 
 STACKS_SIGNAL: Final = signal.SIGUSR2
 """Makes a GMI write the stacks of all its threads to its log."""
@@ -216,7 +220,9 @@ def _exit_without_teardown(exit_codes: list[int]) -> None:
     inside the library's C++, which aborts the process (https://github.com/python/cpython/issues/87135):
     a GMI that has done all would count as failed.
     """
-    for stream in (sys.stdout, sys.stderr):
+    gc.unfreeze()  # Else its objects are not found.
+    writers = [one for one in gc.get_objects() if issubclass(type(one), _WRITERS)]
+    for stream in (sys.stdout, sys.stderr, *writers):
         with suppress(OSError, ValueError, AttributeError):  # Closed, or the disk is full.
             stream.flush()
     os._exit(exit_codes[0])

@@ -19,7 +19,7 @@ from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.profile import ProfileLate
 from gmijax.autotune.report import draw
 from gmijax.autotune.tuner import Search, SearchResult, with_auto_decided
-from gmijax.autotune.workloads import PpoWorkload, Workload
+from gmijax.autotune.workloads import SynchronousWorkload, Workload
 from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
 from gmijax.control import searching
@@ -77,7 +77,7 @@ def wanted(*overrides: str) -> TrainConfig:
 def found(*overrides: str, here: Machine | None = None) -> tuple[SearchResult, str]:
     said = io.StringIO()
     console = Console(file=said, width=400, markup=False)
-    result = Search(PpoWorkload(wanted(*overrides)), here or machine(0), console).result()
+    result = Search(SynchronousWorkload(wanted(*overrides)), here or machine(0), console).result()
     return result, said.getvalue()
 
 

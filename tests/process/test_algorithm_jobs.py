@@ -1,0 +1,61 @@
+"""Jobs of the algorithms beside PPO and A3C: several GMIs, checkpoints, another start."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from training_jobs import POINT, learner_arrays, train
+
+BASE = (
+    *(POINT[0], "num_envs=16", "algo.unroll_length=4", "algo.policy_hidden_layer_sizes=[8]"),
+    *("run.measure_throughput=false", "run.grace_s=3", "run.max_restarts=0"),
+)
+
+SAC = (
+    *("algo=sac", "algo.batch_size=32", "algo.updates_per_step=1"),
+    *("algo.critic_hidden_layer_sizes=[16]", "algo.num_atoms=11", "algo.replay_steps=16"),
+    "algo.learning_starts=4",
+)
+
+
+@pytest.mark.timeout(300)
+def test_a_student_keeps_its_teacher_and_goes_on(tmp_path: Path) -> None:
+    done = train(*POINT, "num_timesteps=640", "run.dir=runs/teacher", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    line = ("algo=distill", "algo.teacher=last", "plan.gpus=2", "num_timesteps=1024")
+    done = train(*BASE, *line, "run.dir=runs/student", "run.checkpoint_every=2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    student = tmp_path / "runs" / "student"
+    teacher = json.loads((student / "config.json").read_text())["algo"]["teacher"]
+    assert Path(teacher).parent == tmp_path / "runs" / "teacher" / "checkpoints"
+    # By now the newest run is the student's own.
+    half = sorted((student / "checkpoints").iterdir())[0]
+    done = train(f"run.resume={half}", "run.dir=runs/again", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    again = learner_arrays(tmp_path / "runs" / "again")
+    for array, other in zip(again, learner_arrays(student), strict=True):
+        np.testing.assert_array_equal(array, other)
+    done = train(*BASE, "algo=distill", "algo.teacher=runs/nobody", "run.dir=x", cwd=tmp_path)
+    assert (done.returncode, (tmp_path / "x").exists()) == (2, False)
+    assert "algo.teacher=runs/nobody: no such folder" in done.stderr
+
+
+@pytest.mark.timeout(300)
+def test_two_gmis_learn_by_sac_and_fill_the_replay_anew_when_they_go_on(tmp_path: Path) -> None:
+    line = ("plan.gpus=2", "run.checkpoint_every=3", "num_timesteps=1024")
+    done = train(*BASE, *SAC, *line, "run.dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    half = sorted((tmp_path / "run" / "checkpoints").iterdir())[0]
+    done = train(f"run.resume={half}", "run.dir=again", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for run, first in (("run", 4.0), ("again", 4.0)):
+        lines = [
+            json.loads(x) for x in (tmp_path / run / "metrics.jsonl").read_text().splitlines()
+        ]
+        assert lines[-1]["env_steps"] == 1024
+        assert lines[-1]["loss/critic_loss"] > 0
+        own = lines if run == "run" else lines[3:]
+        assert own[0]["replay/steps"] == first
