@@ -74,18 +74,32 @@ def test_without_locks_nobody_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_who_waits_is_told_and_finds_what_was_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    waits: list[str] = []
+    calls: list[str] = []
 
     def flock(_: int, operation: int) -> None:
-        if operation & fcntl.LOCK_NB:
+        calls.append("unlocks" if operation == fcntl.LOCK_UN else "asks")
+        if calls.count("asks") < 3:
             raise BlockingIOError
-        waits.append("waits")
         (tmp_path / "jit_f-k-lock").write_text("jit_f-1-cache")
         compile_entry(tmp_path)
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    monkeypatch.setattr(compile_lock, "ON_WAIT", [lambda: nullcontext(waits.append("begins"))])
+    monkeypatch.setattr(compile_lock, "_POLL_S", 0.0)
+    monkeypatch.setattr(compile_lock, "ON_WAIT", [lambda: nullcontext(calls.append("waits"))])
     assert compile_alone(tmp_path, "jit_f", "k", lambda: "loaded") == "loaded"
-    assert waits == ["begins", "waits"]
+    assert calls == ["asks", "waits", "asks", "asks", "unlocks"]
     # It was loaded after the lock was given back, so it has written nothing.
+    assert (tmp_path / "jit_f-k-lock").read_text() == "jit_f-1-cache"
+
+
+def test_a_lock_that_nobody_releases_is_not_waited_for_without_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def flock(*_: object) -> None:
+        raise BlockingIOError
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    monkeypatch.setattr(compile_lock, "LONGEST_WAIT_S", 0.0)
+    assert compile_alone(tmp_path, "jit_f", "k", lambda: compile_entry(tmp_path)) == "program"
+    # Later ones find what it has compiled.
     assert (tmp_path / "jit_f-k-lock").read_text() == "jit_f-1-cache"
