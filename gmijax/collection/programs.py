@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from gmijax.learning.algorithm import init_of
-from gmijax.learning.checkpoint import digest, restore_learner
+from gmijax.learning.algorithm import saved_state
+from gmijax.learning.checkpoint import digest
 from gmijax.learning.learner import Learner, acting_moments, make_learner
 from gmijax.learning.normalize import normalize
 from gmijax.learning.unroll import Counts, Outcome, count, outcome_of
@@ -59,8 +58,7 @@ def trained_policy(checkpoint: Path, spec: EnvSpec, *, deterministic: bool) -> A
     """
     algo = trained_config(checkpoint)[1]
     learner = make_learner(spec, algo)
-    start = jax.jit(partial(init_of(algo), learner, spec.obs_size))(jax.random.key(0))
-    state = restore_learner(checkpoint, start)
+    state = saved_state(checkpoint, learner, spec.obs_size)
     weights = state.params, acting_moments(learner.config, state)
     sha = digest(weights).astype("uint16").tobytes().hex()
     return ActingPolicy(_trained(learner, deterministic), weights, sha)

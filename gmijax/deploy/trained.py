@@ -7,13 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gmijax.config import AlgoConfig
-from gmijax.learning.algorithm import init_of
-from gmijax.learning.checkpoint import learner_sizes, restore_learner
+from gmijax.learning.algorithm import saved_state
+from gmijax.learning.checkpoint import learner_sizes
 from gmijax.learning.learner import acting_weights, make_learner
 from gmijax.learning.normalize import OBS_CLIP, Moments, normalize, std_of
 from gmijax.runs.resume import CheckpointMeta
@@ -52,8 +51,7 @@ def trained_policy(checkpoint: Path) -> TrainedPolicy:
     spec = EnvSpec(env.label, full_size, action_size, 0.0, 0, (), actor_obs_size=obs_size)
     # Weights are float32, and not every runtime has another format.
     learner = make_learner(spec, replace(algo, precision="float32"))
-    state = jax.jit(lambda key: init_of(algo)(learner, full_size, key))(jax.random.key(0))
-    weights = acting_weights(learner, restore_learner(checkpoint, state))
+    weights = acting_weights(learner, saved_state(checkpoint, learner, full_size))
     count, mean, m2 = weights.moments
     moments = Moments(count, mean[:obs_size], m2[:obs_size])
 

@@ -26,9 +26,9 @@ from gmijax.learning.learner import (
     make_learner,
     policy_figures,
 )
-from gmijax.learning.normalize import Moments, merge_all, moments_of, normalize, without_outliers
+from gmijax.learning.normalize import moments_of, normalize, without_outliers
 from gmijax.learning.policy import ActorCriticParams
-from gmijax.learning.unroll import Counts, act, count, outcome_of, unroll
+from gmijax.learning.unroll import RolloutSums, act, count, merge_sums, outcome_of, unroll
 from gmijax.learning.updates import exchange_size, minibatch_order, run_updates
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
@@ -65,13 +65,6 @@ class DistillLosses(NamedTuple):
         return jnp.zeros(())
 
 
-class _Stats(NamedTuple):
-    """What GMIs exchange of a rollout: moments of the raw observations, sums over all steps."""
-
-    obs: Moments
-    counts: Counts
-
-
 def iterate(
     env: BatchedEnv,
     learner: DistillLearner,
@@ -83,14 +76,14 @@ def iterate(
     """See `gmijax.learning.algorithm.Iterate`."""
     env_state, samples, stats = _rollout(env, learner, model, state, env_state)
     everyone = collectives.all_gather(stats)
-    counts = jax.tree.map(lambda x: jnp.sum(x, axis=0), everyone.counts)
+    seen, counts = merge_sums(everyone)
     size = samples.target[..., 0].size
     order = minibatch_order(learner.config, state, collectives.rank(), size)
     flat = jax.tree.map(lambda x: x.reshape(size, *x.shape[2:]), samples)
     state, losses, _ = run_updates(
         learner, collectives, _gradients, state, flat, None, order, after=everyone
     )
-    state = finish_iteration(learner, state, merge_all(everyone.obs))
+    state = finish_iteration(learner, state, seen)
     means = jax.tree.map(jnp.mean, losses)
     return state, env_state, IterationMetrics(counts, means, policy_figures(state), {})
 
@@ -101,7 +94,7 @@ def _rollout(
     model: PyTree,
     state: TrainState,
     env_state: BatchState,
-) -> tuple[BatchState, Samples, _Stats]:
+) -> tuple[BatchState, Samples, RolloutSums]:
     """T steps of the student, with the teacher's actions."""
     weights = acting_weights(learner, state)
 
@@ -119,7 +112,7 @@ def _rollout(
     )
     seen = moments_of(without_outliers(weights.moments, raw_obs), 2)
     samples = Samples(normalize(weights.moments, raw_obs), learner.extra.action(raw_obs))
-    return env_state, samples, _Stats(seen, count(rewards, outcomes))
+    return env_state, samples, RolloutSums(seen, count(rewards, outcomes))
 
 
 def _gradients(

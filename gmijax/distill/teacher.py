@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from gmijax.errors import ConfigError
-from gmijax.learning.algorithm import init_of
-from gmijax.learning.checkpoint import learner_sizes, restore_learner
+from gmijax.learning.algorithm import saved_state
+from gmijax.learning.checkpoint import learner_sizes
 from gmijax.learning.learner import ActingWeights, acting_weights, make_learner
 from gmijax.learning.normalize import normalize
 from gmijax.learning.policy import ActorCritic
@@ -52,6 +51,5 @@ def load_teacher(named: str, spec: EnvSpec) -> Teacher:
             f"{action_size} actions; {spec.name} has {spec.obs_size} and {spec.action_size}"
         )
     learner = make_learner(spec, algo)
-    state = jax.jit(lambda key: init_of(algo)(learner, obs_size, key))(jax.random.key(0))
-    weights = acting_weights(learner, restore_learner(checkpoint, state))
+    weights = acting_weights(learner, saved_state(checkpoint, learner, obs_size))
     return Teacher(learner.networks, weights)

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import jax
 
 from gmijax.collectives.interface import Collectives
 from gmijax.config import AlgoConfig
+from gmijax.learning.checkpoint import restore_learner
 from gmijax.learning.learner import Learner, LearnerState, init_learner
 from gmijax.learning.unroll import Counts
 from gmijax.sim.interface import EnvSpec
@@ -25,11 +28,6 @@ from gmijax.types import Array, PRNGKey, PyTree
 
 class Losses(Protocol):
     """Parts of a loss, means over a minibatch: a named tuple of [] float32."""
-
-    @property
-    def steering_kl(self) -> Array:
-        """The divergence that the adaptive learning rate follows."""
-        ...
 
     def _asdict(self) -> dict[str, Any]: ...
 
@@ -121,3 +119,13 @@ def iterate_all(
 ) -> tuple[Any, Any, IterationMetrics]:
     """An iteration of several runs; states, memories and metrics have a leading axis [K]."""
     return jax.vmap(lambda *own: iterate(env, learner, collectives, model, *own))(states, memories)
+
+
+def saved_state(checkpoint: Path, learner: Learner[Any], obs_size: int) -> Any:
+    """The learner's state in a checkpoint of a run with such a learner.
+
+    Raises:
+      ConfigError: it does not fit the learner.
+    """
+    init = partial(init_of(learner.config), learner, obs_size)
+    return restore_learner(checkpoint, jax.jit(init)(jax.random.key(0)))

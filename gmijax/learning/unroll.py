@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.learning.learner import ActingWeights
-from gmijax.learning.normalize import normalize
+from gmijax.learning.normalize import Moments, merge_all, normalize
 from gmijax.learning.policy import ActorCritic
 from gmijax.sim.divergence import sources
 from gmijax.sim.interface import EnvSpec
@@ -40,6 +40,18 @@ class Counts(NamedTuple):
     reward_sum: Array
     diverged: dict[str, Array]
     overflowed: dict[str, Array]
+
+
+class RolloutSums(NamedTuple):
+    """What GMIs exchange of a rollout.
+
+    Attributes:
+      obs: moments of the raw observations, [O].
+      counts: sums over all steps.
+    """
+
+    obs: Moments
+    counts: Counts
 
 
 class Drawn(NamedTuple):
@@ -107,6 +119,16 @@ def count(rewards: Array, outcomes: Outcome) -> Counts:
         lambda x: jnp.sum(x, axis=0, dtype=jnp.float32), outcomes
     )
     return Counts(episodes, jnp.sum(rewards), diverged, overflowed)
+
+
+def merge_counts(stacked: Counts) -> Counts:
+    """Counts together; every leaf of `stacked` has a leading axis [K]."""
+    return jax.tree.map(lambda x: jnp.sum(x, axis=0), stacked)
+
+
+def merge_sums(stacked: RolloutSums) -> RolloutSums:
+    """Sums together; every leaf of `stacked` has a leading axis [K]."""
+    return RolloutSums(merge_all(stacked.obs), merge_counts(stacked.counts))
 
 
 def no_counts(spec: EnvSpec, overflows: tuple[str, ...] = ()) -> Counts:

@@ -16,7 +16,7 @@ from gmijax.learning.normalize import (
     no_samples,
     without_outliers,
 )
-from gmijax.learning.unroll import Counts, no_counts
+from gmijax.learning.unroll import Counts, merge_counts, no_counts
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import StepOutput
 from gmijax.types import Array
@@ -66,9 +66,11 @@ def until_diverged(is_diverged: Array, ended: Array) -> Array:
 
 def merge_stats(stacked: RolloutStats) -> RolloutStats:
     """Statistics of all GMIs together; every leaf of `stacked` has a leading axis [K]."""
-    counts = jax.tree.map(lambda x: jnp.sum(x, axis=0), stacked.counts)
     return RolloutStats(
-        merge_all(stacked.obs), merge_all(stacked.advantage), merge_all(stacked.target), counts
+        merge_all(stacked.obs),
+        merge_all(stacked.advantage),
+        merge_all(stacked.target),
+        merge_counts(stacked.counts),
     )
 
 

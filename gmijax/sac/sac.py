@@ -27,14 +27,13 @@ from gmijax.learning.learner import (
 )
 from gmijax.learning.normalize import (
     Moments,
-    merge_all,
     moments_of,
     no_samples,
     normalize,
     without_outliers,
 )
 from gmijax.learning.policy import ActorCriticParams
-from gmijax.learning.unroll import Counts, act, count, outcome_of, unroll
+from gmijax.learning.unroll import RolloutSums, act, count, merge_sums, outcome_of, unroll
 from gmijax.sac.critics import Critics, critics_of
 from gmijax.sac.losses import (
     Batch,
@@ -110,18 +109,6 @@ class SacLosses(NamedTuple):
     entropy: Array
     end_atoms: Array
 
-    @property
-    def steering_kl(self) -> Array:
-        """None is followed: the learning rate is fixed."""
-        return jnp.zeros(())
-
-
-class _Stats(NamedTuple):
-    """What GMIs exchange of a rollout: moments of the raw observations, sums over all steps."""
-
-    obs: Moments
-    counts: Counts
-
 
 def init(learner: SacLearner, obs_size: int, key: PRNGKey) -> SacState:
     """The first state; consumes `key`."""
@@ -169,10 +156,9 @@ def iterate(
     keys = jax.random.split(key, config.unroll_length)
     one_round = partial(_round, env, learner, collectives, model)
     (state, memory), (stats, losses, is_due) = jax.lax.scan(one_round, (state, memory), keys)
-    own = _Stats(merge_all(stats.obs), jax.tree.map(lambda x: jnp.sum(x, axis=0), stats.counts))
-    everyone = collectives.all_gather(own, after=losses)
-    counts = jax.tree.map(lambda x: jnp.sum(x, axis=0), everyone.counts)
-    state = finish_iteration(learner, state, merge_all(everyone.obs))
+    everyone = collectives.all_gather(merge_sums(stats), after=losses)
+    seen, counts = merge_sums(everyone)
+    state = finish_iteration(learner, state, seen)
     figures = {
         **policy_figures(state),
         "policy/temperature": jnp.exp(state.log_temperature),
@@ -191,7 +177,7 @@ def _round(
     model: PyTree,
     before: tuple[SacState, Memory],
     key: PRNGKey,
-) -> tuple[tuple[SacState, Memory], tuple[_Stats, SacLosses, Array]]:
+) -> tuple[tuple[SacState, Memory], tuple[RolloutSums, SacLosses, Array]]:
     """A step of all environments, and the updates after it."""
     config, (state, memory) = learner.config, before
     memory, stats = _act(env, learner, model, state, memory)
@@ -207,7 +193,7 @@ def _round(
 
 def _act(
     env: BatchedEnv, learner: SacLearner, model: PyTree, state: SacState, memory: Memory
-) -> tuple[Memory, _Stats]:
+) -> tuple[Memory, RolloutSums]:
     """A step of this GMI's environments, into its replay."""
     weights = acting_weights(learner, state)
 
@@ -227,7 +213,7 @@ def _act(
     # Each observation counts once, when it is made: batches show the same ones again and again.
     seen = moments_of(without_outliers(weights.moments, obs), 2)
     replay = insert(memory.replay, obs, action, reward, kind)
-    return Memory(envs, replay), _Stats(seen, count(reward, outcomes))
+    return Memory(envs, replay), RolloutSums(seen, count(reward, outcomes))
 
 
 def _update(

@@ -6,7 +6,6 @@ Restores a policy, runs episodes with it, and writes their returns and a traject
 from __future__ import annotations
 
 import dataclasses
-import functools
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,8 +31,7 @@ def _run(link: ChildLink) -> None:
     # jax starts here, in the environment that the plan prepared.
     import jax
 
-    from gmijax.learning.algorithm import init_of
-    from gmijax.learning.checkpoint import restore_learner
+    from gmijax.learning.algorithm import saved_state
     from gmijax.learning.episodes import Options, run_episodes
     from gmijax.learning.learner import make_learner
     from gmijax.sim.camera import check_camera, choose_camera
@@ -46,9 +44,7 @@ def _run(link: ChildLink) -> None:
     env = make_worlds(played, impl, seed=config.seed, first_env=0, num_envs=config.num_envs)
     check_camera(env.mj_model, config.camera, env.spec.name)
     learner = make_learner(env.spec, algo)
-    init = functools.partial(init_of(algo), learner, env.spec.obs_size)
-    state = jax.jit(init)(jax.random.key(0))
-    state = restore_learner(checkpoint, state)
+    state = saved_state(checkpoint, learner, env.spec.obs_size)
     link.beat("compiling", 0)
     episodes = run_episodes(
         env,
