@@ -119,7 +119,9 @@ def test_what_a_fresh_interpreter_has_by_itself_is_not_added(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(("", "/named", "/named/too")))
     (tmp_path / "a:b").mkdir()
-    path = ["", "/named", *sys.path, str(tmp_path / "gone"), str(tmp_path / "a:b")]
+    # Not this process's path: packages that other tests import, such as ray, add to it.
+    fresh = run([sys.executable, "-c", "import json, sys; print(json.dumps(sys.path))"], tmp_path)
+    path = ["", "/named", *json.loads(fresh.stdout), str(tmp_path / "gone"), str(tmp_path / "a:b")]
     added = interpreter.added_paths(path)
     assert added[0] == str(tmp_path)  # '' is the working directory, also after a change of it.
     assert "/named" not in added
