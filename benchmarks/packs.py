@@ -102,12 +102,12 @@ class Benchmark:
                 "curves": _curves(report["jobs"]) if given.curves else None,
             }
 
-    def _kept_to(self, place: int) -> tuple[Sequence[str], dict[str, str]]:
+    def _kept_to(self, slot: int) -> tuple[Sequence[str], dict[str, str]]:
         """Words before a command, and its variables: one GPU with its part of the cores."""
         cpus, gpus = self._machine.cpu_cores, self._machine.gpus
         each = len(cpus) // min(self._given.gpus, len(gpus))
-        own = ",".join(map(str, cpus[place * each : (place + 1) * each]))
-        device = str(gpus[place].index)
+        own = ",".join(map(str, cpus[slot * each : (slot + 1) * each]))
+        device = str(gpus[slot].index)
         variables = {"CUDA_VISIBLE_DEVICES": device, "CUDA_DEVICE_ORDER": "PCI_BUS_ID"}
         return ("taskset", "--cpu-list", own), variables
 

@@ -88,12 +88,16 @@ def check_share(plan: Plan, gmi: int) -> float:
         for library, options in LIBRARIES.items()
     }
     if found := [product for products in wrong.values() for product in products]:
-        share = plan.slices[gmi]
+        allocation = plan.allocations[gmi]
         worst = max(found, key=lambda product: product.error / product.precision.tolerance)
         libraries = [library for library, products in wrong.items() if products]
-        cap = "no cap" if share.sm_percent is None else f"plan.sm_percent={share.sm_percent:g}"
+        cap = (
+            "no cap"
+            if allocation.sm_percent is None
+            else f"plan.sm_percent={allocation.sm_percent:g}"
+        )
         raise SelfCheckFailed(
-            f"matrix products are wrong on {share.device} with {cap}: "
+            f"matrix products are wrong on {allocation.device} with {cap}: "
             f"{', '.join(sorted({product.precision.name for product in found}))} "
             f"({', '.join(libraries)}); worst {_described(worst)}; choose another share, see "
             "docs/shares.md"

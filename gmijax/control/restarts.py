@@ -281,7 +281,7 @@ def _lost(plan: Plan, machine: Machine) -> set[int]:
         return set()
     present = {gpu.uuid for gpu in machine.gpus}
     present |= {one.uuid for gpu in machine.gpus for one in gpu.instances}
-    return {share.gpu for share in plan.slices if share.device not in present}
+    return {allocation.gpu for allocation in plan.allocations if allocation.device not in present}
 
 
 def _without(config: TrainConfig, plan: Plan, machine: Machine, lost: set[int]) -> PlanConfig:
@@ -289,7 +289,7 @@ def _without(config: TrainConfig, plan: Plan, machine: Machine, lost: set[int]) 
     kept = [position for position in range(plan.layout.num_gpus) if position not in lost]
     index_of = {gpu.uuid: gpu.index for gpu in machine.gpus}
     index_of |= {one.uuid: gpu.index for gpu in machine.gpus for one in gpu.instances}
-    device_of = {share.gpu: share.device for share in plan.slices}
+    device_of = {allocation.gpu: allocation.device for allocation in plan.allocations}
     gpus = tuple(index_of[device_of[position]] for position in kept)
     rows = config.plan.layout
     if rows is not None:

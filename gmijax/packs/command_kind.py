@@ -30,8 +30,8 @@ from gmijax.supervise.start_gmi import program_cache
 from gmijax.sweeps.children import Process, Seen
 from gmijax.sweeps.kind import Start
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Place
 from gmijax.sweeps.running import Outcome, Running
+from gmijax.sweeps.slots import Slot
 
 _CLIENT_AFTER_S: Final = 30.0
 """When a job that reports nothing has taken its GPU."""
@@ -73,7 +73,7 @@ class CommandKind:
       paths: its files.
       cores: CPU cores that the jobs of a GPU share, by site.
       names: of the machines, by site; None: this one.
-      at_once: number of jobs that share a GPU and the cores at a place.
+      at_once: number of jobs that share a GPU and the cores at a slot.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class CommandKind:
         paths: PackPaths,
         cores: Sequence[int],
         names: Sequence[str | None],
-        at_once: Callable[[Place], int],
+        at_once: Callable[[Slot], int],
     ) -> None:
         self._settings, self._paths = settings, paths
         self._cores, self._names, self._at_once = cores, names, at_once
@@ -99,7 +99,7 @@ class CommandKind:
         del queue, alone
         return (job,)
 
-    def start(self, jobs: tuple[CommandJob, ...], place: Place) -> Start:
+    def start(self, jobs: tuple[CommandJob, ...], slot: Slot) -> Start:
         """See `Kind`."""
         (job,) = jobs
         number, settings = job.number, self._settings
@@ -116,12 +116,12 @@ class CommandKind:
         arguments = job.arguments(run_dir, more)
         with log.open("a") as file:
             file.write(f"$ {shlex.join(arguments)}\n")
-        at_once = 1 if place.is_alone else self._at_once(place)
+        at_once = 1 if slot.is_alone else self._at_once(slot)
         process = Process(
             f"job {run_dir.name}",
             arguments,
             log,
-            self._variables(job, run_dir, self._cores[place.site] // at_once),
+            self._variables(job, run_dir, self._cores[slot.site] // at_once),
             cwd=None if settings.cwd is None else job.folder(run_dir, settings.cwd),
             is_client=True,
             memory_fraction=None if at_once == 1 else 1.0 / at_once,
@@ -136,7 +136,7 @@ class CommandKind:
             events = EventReader(run_dir, settings.tag, time.time(), running_s)
         progress = ProgressReader(output, self._own, running_s(), running_s, events)
         # On CPU cores alone nothing is compiled that others could use.
-        mark = _mark_of(job, self._names[place.site]) if place.devices else None
+        mark = _mark_of(job, self._names[slot.site]) if slot.devices else None
         reader = _Recorder(progress, run.metrics, mark)
         return Start(process, (reader,), is_awaited=mark is not None and not mark.exists())
 
@@ -180,7 +180,7 @@ class CommandKind:
         if attempt.is_client or not (is_due or running_s() - latest_s > _CLIENT_AFTER_S):
             return
         attempt.client_asked_s = running_s()
-        if running.place.backend == "mps":
+        if running.slot.backend == "mps":
             job.progress.note = running.host.why_no_client(running.child)
         attempt.is_client = job.progress.note is None
 
@@ -198,7 +198,7 @@ class CommandKind:
             return Outcome()
         attempt = self._attempts[job.number]
         why = failure_of(seen.exit_code, self._paths.log(job.number), attempt.begins)
-        is_shared = running.place.backend in ("mps", "mig") and not running.place.is_alone
+        is_shared = running.slot.backend in ("mps", "mig") and not running.slot.is_alone
         alone, again = why.is_out_of_memory, None
         if why.is_gpu_fault and is_shared:
             alone = self._is_suspect(running, job)
@@ -221,7 +221,7 @@ class CommandKind:
         CUDA tells all clients and does not say whose fault it was: the first to end is the
         suspect, and who has often been near.
         """
-        gpu, now_s = (running.place.site, running.place.slices[0].gpu), running_s()
+        gpu, now_s = (running.slot.site, running.slot.allocations[0].gpu), running_s()
         is_first = now_s - self._faulted_s.get(gpu, -math.inf) > _SAME_FAULT_S
         if is_first:
             self._faulted_s[gpu] = now_s

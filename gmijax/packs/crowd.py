@@ -14,8 +14,8 @@ from gmijax.machine.nvidia import GpuLoad
 from gmijax.packs.command_job import CommandJob
 from gmijax.sweeps.density import Decision, Density, Seen
 from gmijax.sweeps.nodes import Host
-from gmijax.sweeps.places import Place, Places, Site
 from gmijax.sweeps.running import Running
+from gmijax.sweeps.slots import Site, Slot, SlotPool
 
 MOST_CLIENTS: Final = 48
 """Contexts of an MPS daemon on one GPU before driver 590
@@ -36,22 +36,22 @@ _IDLE: Final = 0.6
 
 
 class Crowd:
-    """Limits the places of each GPU to what its rule decides.
+    """Limits the slots of each GPU to what its rule decides.
 
     Attributes:
       decisions: all changes so far, as the report has them.
 
     Args:
-      places: of the jobs.
-      sites: machines, in the order of `places`.
+      slots: of the jobs.
+      sites: machines, in the order of `slots`.
       hosts: the same.
       console: where changes are printed.
     """
 
     def __init__(
-        self, places: Places, sites: Sequence[Site], hosts: Sequence[Host], console: Console
+        self, slots: SlotPool, sites: Sequence[Site], hosts: Sequence[Host], console: Console
     ) -> None:
-        self._places, self._hosts, self._console = places, hosts, console
+        self._slots, self._hosts, self._console = slots, hosts, console
         self._looked_s = self._began_s = running_s()
         self._gpus: dict[tuple[int, int], _Gpu] = {}
         self.decisions: list[dict[str, Any]] = []
@@ -59,17 +59,17 @@ class Crowd:
             titles = {gpu.uuid: f"GPU {gpu.index}" for gpu in site.machine.gpus}
             node = f"{site.name} " if site.name else ""
             by_gpu: dict[int, list[str]] = defaultdict(list)
-            for share in site.plan.slices:
-                by_gpu[share.gpu].append(share.device)
+            for allocation in site.plan.allocations:
+                by_gpu[allocation.gpu].append(allocation.device)
             for gpu, devices in by_gpu.items():
                 device = devices[0]
                 title = f"{node}{titles.get(device, device)}"
                 self._gpus[number, gpu] = _Gpu(device, title, len(devices), host)
-                places.limit(number, gpu, 1)
+                slots.limit(number, gpu, 1)
 
-    def at_once(self, place: Place) -> int:
-        """Jobs that are to share the GPU of a place."""
-        return self._gpus[place.site, place.slices[0].gpu].rule.target
+    def at_once(self, slot: Slot) -> int:
+        """Jobs that are to share the GPU of a slot."""
+        return self._gpus[slot.site, slot.allocations[0].gpu].rule.target
 
     def look(self, running: Sequence[Running[CommandJob]]) -> list[Running[CommandJob]]:
         """See `Limiter`."""
@@ -79,14 +79,14 @@ class Crowd:
         self._looked_s = now_s
         ended: list[Running[CommandJob]] = []
         for key, gpu in self._gpus.items():
-            here = [one for one in running if (one.place.site, one.place.slices[0].gpu) == key]
+            here = [one for one in running if (one.slot.site, one.slot.allocations[0].gpu) == key]
             if here and not any(one.is_asked for one in here):
                 ended += self._apply(key, gpu.look(now_s, here), here)
         return ended
 
     def forbid(self, running: Running[CommandJob], why: str) -> bool:
         """See `Limiter`."""
-        key = running.place.site, running.place.slices[0].gpu
+        key = running.slot.site, running.slot.allocations[0].gpu
         gpu = self._gpus[key]
         decision = gpu.rule.forbid(gpu.rule.target, why)
         self._apply(key, decision, [])
@@ -101,7 +101,7 @@ class Crowd:
         if decision is None:
             return []
         gpu = self._gpus[key]
-        self._places.limit(*key, decision.target)
+        self._slots.limit(*key, decision.target)
         gpu.since_s = running_s()
         self._console.print(f"  {gpu.title}: {decision.target} at once; {decision.why}")
         measured = {str(count): found.per_s for count, found in gpu.rule.measured.items()}
@@ -121,11 +121,11 @@ class Crowd:
 class _Gpu:
     """One GPU: its rule, and the memory that its jobs take."""
 
-    def __init__(self, device: str, title: str, places: int, host: Host) -> None:
+    def __init__(self, device: str, title: str, slots: int, host: Host) -> None:
         self.device, self.title, self._host = device, title, host
         self.since_s = 0.0
-        self._places = places
-        self.rule = Density(places)
+        self._slots = slots
+        self.rule = Density(slots)
         self._measured: set[tuple[str, ...]] = set()
         found = host.load_of(device)
         self._before_mib = found.used_mib if found else 0.0
@@ -166,7 +166,7 @@ class _Gpu:
         if not self.rule.is_settled:
             self._measured |= commands
         elif self._measured and self._measured.isdisjoint(commands):
-            self.rule = Density(self._places, self.rule.target)
+            self.rule = Density(self._slots, self.rule.target)
             self._measured, self._peak_mib, self._has_doubled = commands, 0.0, False
 
     def _by_memory(self, load: GpuLoad, count: int) -> Decision | None:

@@ -32,9 +32,9 @@ from gmijax.sweeps.jobs_per_gpu import CORES_OF_A_JOB
 from gmijax.sweeps.kind import Kind, Limiter
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Place, Places, Site, places_of
 from gmijax.sweeps.progress import State
 from gmijax.sweeps.runner import SweepResult, run_work
+from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
 from gmijax.sweeps.space import Choices, Space, corners, grid
 from gmijax.sweeps.work import Folder, Work
 
@@ -82,14 +82,14 @@ class PackWork(Work[CommandJob]):
         for host in hosts:
             settings = replace(self.ranking, jobs_per_gpu=self._most(host))
             try:
-                plan = places_of(settings, host.machine, {self.ranking.backend})
+                plan = plan_slots(settings, host.machine, {self.ranking.backend})
             except ConfigError as error:
                 raise ConfigError(str(error).replace("plan.backend", "pack.backend")) from None
             sites.append(Site(plan, host.machine, host.name))
         return sites
 
     def _most(self, host: Host) -> int:
-        """Places on each GPU: all that may be used at once."""
+        """Slots on each GPU: all that may be used at once."""
         settings, cores = self.ranking, len(host.machine.cpu_cores)
         if settings.jobs_per_gpu != "auto":
             return settings.jobs_per_gpu
@@ -118,27 +118,27 @@ class PackWork(Work[CommandJob]):
     def kind(self, paths: SweepPaths, sites: Sequence[Site]) -> Kind[CommandJob]:
         """See `Work`."""
         cores = [
-            len(site.machine.cpu_cores) // max(1, len({one.gpu for one in site.plan.slices}))
+            len(site.machine.cpu_cores) // max(1, len({one.gpu for one in site.plan.allocations}))
             for site in sites
         ]
-        most = [max(1, len(site.plan.slices)) for site in sites]
+        most = [max(1, len(site.plan.allocations)) for site in sites]
 
-        def at_once(place: Place) -> int:
-            if self.crowds and place.devices:
-                return self.crowds[-1].at_once(place)
-            gpus = sites[place.site].plan.layout.num_gpus
-            return most[place.site] // gpus if place.devices else most[place.site]
+        def at_once(slot: Slot) -> int:
+            if self.crowds and slot.devices:
+                return self.crowds[-1].at_once(slot)
+            gpus = sites[slot.site].plan.layout.num_gpus
+            return most[slot.site] // gpus if slot.devices else most[slot.site]
 
         names = [site.name for site in sites]
         return CommandKind(self.ranking, cast("PackPaths", paths), cores, names, at_once)
 
     def limiter(
-        self, places: Places, sites: Sequence[Site], hosts: Sequence[Host], console: Console
+        self, slots: SlotPool, sites: Sequence[Site], hosts: Sequence[Host], console: Console
     ) -> Limiter[CommandJob] | None:
         """See `Work`."""
         if not self.is_adaptive or not sites[0].machine.gpus:
             return None
-        self.crowds.append(Crowd(places, sites, hosts, console))
+        self.crowds.append(Crowd(slots, sites, hosts, console))
         return self.crowds[-1]
 
     def warnings(self, sites: Sequence[Site]) -> Sequence[str]:

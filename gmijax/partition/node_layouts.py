@@ -13,7 +13,7 @@ from gmijax.errors import ConfigError
 from gmijax.machine.differences import differences_in_gpus
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.layout import Layout
-from gmijax.partition.plan import Slice
+from gmijax.partition.plan import Allocation
 
 
 class NodeLayout(NamedTuple):
@@ -80,17 +80,19 @@ def on_nodes(
     return layout.on_nodes(len(nodes))
 
 
-def divided_between_nodes(slices: Sequence[Slice], reasons: list[str]) -> list[Slice]:
+def divided_between_nodes(
+    allocations: Sequence[Allocation], reasons: list[str]
+) -> list[Allocation]:
     """With less memory for GMIs on a GPU that several nodes have: these are one machine."""
     gpus_of: dict[str, set[int]] = {}
-    for share in slices:
-        gpus_of.setdefault(share.device, set()).add(share.gpu)
-    divided: list[Slice] = []
-    for share in slices:
-        fraction, owners = share.memory_fraction, len(gpus_of[share.device])
+    for allocation in allocations:
+        gpus_of.setdefault(allocation.device, set()).add(allocation.gpu)
+    divided: list[Allocation] = []
+    for allocation in allocations:
+        fraction, owners = allocation.memory_fraction, len(gpus_of[allocation.device])
         if fraction is not None and owners > 1:
             fraction = round(fraction / owners, 4)
-        divided.append(dataclasses.replace(share, memory_fraction=fraction))
-    if divided != list(slices):
+        divided.append(dataclasses.replace(allocation, memory_fraction=fraction))
+    if divided != list(allocations):
         reasons.append("nodes of one machine have the same GPUs, and divide their memory")
     return divided

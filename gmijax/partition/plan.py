@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import Any
 
 from gmijax.config import BackendName, TemplateName
@@ -19,8 +20,8 @@ MAX_MEMORY_FRACTION = 0.9
 
 
 @dataclass(frozen=True)
-class Slice:
-    """The share of one GMI.
+class Allocation:
+    """What one GMI has of a GPU and of the CPU cores.
 
     Attributes:
       gmi: its id.
@@ -45,7 +46,7 @@ class Plan:
 
     Attributes:
       layout: GPU -> GMIs.
-      slices: one per GMI, in order of id.
+      allocations: one per GMI, in order of id.
       backend: how shares are enforced.
       template: how roles map to GMIs.
       num_envs_per_gmi: N.
@@ -55,15 +56,16 @@ class Plan:
         that is classes of the user's own.
       reasons: what was decided for an `auto`, and why, one sentence each.
       self_check: every GMI compares matrix products with float64 when it starts.
-      may_share: where the daemons of `mps` cannot be started, the GMIs may take turns instead.
+      allow_fallback: where the daemons of `mps` cannot be started, backend `share` may be used.
       nodes: addresses of the nodes of the layout, in order; none in a job on one machine.
 
     Raises:
-      ConfigError: slices or roles that do not fit the layout, or memory fractions over the limit.
+      ConfigError: allocations or roles that do not fit the layout, or memory fractions over the
+        limit.
     """
 
     layout: Layout
-    slices: tuple[Slice, ...]
+    allocations: tuple[Allocation, ...]
     backend: BackendName
     template: TemplateName
     num_envs_per_gmi: int
@@ -72,20 +74,22 @@ class Plan:
     roles: tuple[str, ...]
     reasons: tuple[str, ...] = ()
     self_check: bool = False
-    may_share: bool = False
+    allow_fallback: bool = False
     nodes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.layout.num_nodes != max(1, len(self.nodes)):
             raise ConfigError(f"plan: nodes {self.nodes} do not match layout {self.layout}")
-        if [s.gmi for s in self.slices] != list(self.layout.gmis):
-            raise ConfigError(f"plan: slices {self.slices} do not match layout {self.layout}")
+        if [s.gmi for s in self.allocations] != list(self.layout.gmis):
+            raise ConfigError(
+                f"plan: allocations {self.allocations} do not match layout {self.layout}"
+            )
         if self.roles and len(self.roles) != self.layout.num_gmis:
             raise ConfigError(f"plan: roles {self.roles} do not match layout {self.layout}")
         # Two nodes of a cluster may be one machine, with one GPU.
-        for device in dict.fromkeys(share.device for share in self.slices):
-            here = [share for share in self.slices if share.device == device]
-            total = sum(share.memory_fraction or 0.0 for share in here)
+        for device in dict.fromkeys(allocation.device for allocation in self.allocations):
+            here = [allocation for allocation in self.allocations if allocation.device == device]
+            total = sum(allocation.memory_fraction or 0.0 for allocation in here)
             if total > MAX_MEMORY_FRACTION + 1e-9:
                 part = f"{device} of GPU" if self.backend == "mig" else "GPU"
                 raise ConfigError(
@@ -119,17 +123,24 @@ class Plan:
 
     @classmethod
     def _from_dict(cls, data: Mapping[str, Any]) -> Plan:
-        fields = _without(data, "selection")
+        fields = {_FORMER.get(name, name): value for name, value in data.items()}
+        fields.pop("selection", None)
         nodes = tuple(node["address"] for node in data.get("nodes", ()))
         rows = tuple(tuple(gmis) for gmis in data["layout"])
         fields["nodes"], fields["layout"] = nodes, Layout(rows, max(1, len(nodes)))
-        fields["slices"] = tuple(
-            Slice(**{**_without(item, "priority"), "cpus": tuple(item["cpus"])})
-            for item in data["slices"]
+        fields["allocations"] = tuple(
+            Allocation(**{**_without(item, "priority"), "cpus": tuple(item["cpus"])})
+            for item in fields["allocations"]
         )
         fields["reasons"] = tuple(data["reasons"])
         fields["roles"] = tuple(data["roles"])
         return cls(**fields)
+
+
+_FORMER: Mapping[str, str] = MappingProxyType(
+    {"slices": "allocations", "may_share": "allow_fallback"}
+)
+"""What plans of older versions call a field."""
 
 
 def _without(data: Mapping[str, Any], key: str) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from gmijax.partition.node_layouts import (
     node_layouts,
     on_nodes,
 )
-from gmijax.partition.plan import Plan, Slice
+from gmijax.partition.plan import Allocation, Plan
 from gmijax.partition.reduction import (
     is_one_per_gpu,
     needs_ring,
@@ -28,7 +28,7 @@ from gmijax.partition.reduction import (
     why_not_strategy,
     why_not_under,
 )
-from gmijax.partition.shares import make_slices
+from gmijax.partition.shares import make_allocations
 from gmijax.partition.templates import DESCRIPTIONS, TRAINER, group_of, nodes_of, roles_of
 
 _NO_RINGS_ON_CPU = (
@@ -68,13 +68,13 @@ def make_plan(
     of_nodes = node_layouts(layout, machine, nodes)
     backend = _backend(plan, of_nodes, chosen in ("tcg", "tdg"), reasons)
     roles = roles_of(chosen, layout, trainers)
-    slices, gpus = _slices(plan, of_nodes, backend, reasons)
+    allocations, gpus = _allocations(plan, of_nodes, backend, reasons)
     if plan.template == "auto":
         reasons.append(f"template {chosen}: {DESCRIPTIONS[chosen]}")
     strategy, intra = _reduction(reduce, layout, roles, backend, reasons)
     return Plan(
         layout=layout,
-        slices=slices,
+        allocations=allocations,
         backend=backend,
         template=chosen,
         num_envs_per_gmi=num_envs,
@@ -82,8 +82,8 @@ def make_plan(
         intra=intra,
         roles=roles,
         reasons=tuple(reasons),
-        self_check=_self_check(plan, slices, backend, of_nodes),
-        may_share=_may_share(plan, gpus, backend),
+        self_check=_self_check(plan, allocations, backend, of_nodes),
+        allow_fallback=_allow_fallback(plan, gpus, backend),
         nodes=tuple(nodes or ()),
     )
 
@@ -105,14 +105,14 @@ def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:
     return num_gpus * each, f"plan.gmis_per_gpu={each}{gpus}"
 
 
-def _slices(
+def _allocations(
     plan: PlanConfig,
     of_nodes: Sequence[NodeLayout],
     backend: BackendName,
     reasons: list[str],
-) -> tuple[tuple[Slice, ...], tuple[Gpu, ...]]:
+) -> tuple[tuple[Allocation, ...], tuple[Gpu, ...]]:
     """The share of every GMI of its machine, in order of id, and the GPUs of the job."""
-    slices: dict[int, Slice] = {}
+    allocations: dict[int, Allocation] = {}
     chosen: list[Gpu] = []
     num_gpus = 0
     for place, node in enumerate(of_nodes):
@@ -124,13 +124,13 @@ def _slices(
                 require_host(here.num_gmis, what, plan, node.machine)
             if backend != "cpu":
                 gpus = choose_gpus(plan, here, node.machine, backend, said)
-            shares = make_slices(plan, here, gpus, backend, node.machine, said)
-        for share in shares:
-            gmi, gpu = node.gmis[share.gmi], share.gpu + num_gpus
-            slices[gmi] = dataclasses.replace(share, gmi=gmi, gpu=gpu)
+            shares = make_allocations(plan, here, gpus, backend, node.machine, said)
+        for allocation in shares:
+            gmi, gpu = node.gmis[allocation.gmi], allocation.gpu + num_gpus
+            allocations[gmi] = dataclasses.replace(allocation, gmi=gmi, gpu=gpu)
         chosen += gpus
         num_gpus += here.num_gpus
-    in_order = [slices[gmi] for gmi in sorted(slices)]
+    in_order = [allocations[gmi] for gmi in sorted(allocations)]
     if plan.memory_fraction is None:
         in_order = divided_between_nodes(in_order, reasons)
     return tuple(in_order), tuple(chosen)
@@ -174,16 +174,19 @@ def _backend(
 
 
 def _self_check(
-    plan: PlanConfig, slices: Sequence[Slice], backend: BackendName, of_nodes: Sequence[NodeLayout]
+    plan: PlanConfig,
+    allocations: Sequence[Allocation],
+    backend: BackendName,
+    of_nodes: Sequence[NodeLayout],
 ) -> bool:
     if plan.self_check != "auto":
         return plan.self_check == "on"
     # A daemon of somebody else may cap all its clients by default, and does not tell.
     is_theirs = backend == "mps" and any(node.machine.operator_daemon for node in of_nodes)
-    return is_theirs or any((share.sm_percent or 100.0) < 100.0 for share in slices)
+    return is_theirs or any((allocation.sm_percent or 100.0) < 100.0 for allocation in allocations)
 
 
-def _may_share(plan: PlanConfig, gpus: Sequence[Gpu], backend: BackendName) -> bool:
+def _allow_fallback(plan: PlanConfig, gpus: Sequence[Gpu], backend: BackendName) -> bool:
     takes_turns_else = plan.backend == "auto" and backend == "mps" and plan.sm_percent is None
     return takes_turns_else and all(gpu.compute_mode == "default" for gpu in gpus)
 

@@ -16,7 +16,7 @@ from gmijax.errors import ConfigError
 from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.layout import Layout
-from gmijax.partition.plan import Slice
+from gmijax.partition.plan import Allocation
 
 DEFAULT_MEMORY_FRACTION: Final = 0.8
 """Part of a GPU's (or MIG instance's) memory that its GMIs reserve together."""
@@ -29,14 +29,14 @@ _CLIENTS_OF_OLD_DRIVERS, _CLIENTS_OF_NEW_DRIVERS, _NEW_DRIVER = 48, 60, 590
 _SLICES_OF_A_GPU: Final = 7
 
 
-def make_slices(
+def make_allocations(
     plan: PlanConfig,
     layout: Layout,
     gpus: Sequence[Gpu],
     backend: BackendName,
     machine: Machine,
     reasons: list[str],
-) -> tuple[Slice, ...]:
+) -> tuple[Allocation, ...]:
     """The share of every GMI, in order of id; `gpus` are those of the job, none on `cpu`.
 
     Raises:
@@ -49,7 +49,8 @@ def make_slices(
             reasons.append("plan.memory_fraction is not used on the cpu backend")
         cores_of = split_cores(machine.cpu_cores, layout.num_gmis)
         return tuple(
-            Slice(gmi, layout.gpu_of(gmi), "cpu", None, None, cores_of[gmi]) for gmi in layout.gmis
+            Allocation(gmi, layout.gpu_of(gmi), "cpu", None, None, cores_of[gmi])
+            for gmi in layout.gmis
         )
     homes = _homes_of(layout, gpus, backend)
     if plan.memory_fraction is not None:
@@ -60,7 +61,7 @@ def make_slices(
     if backend in ("mps", "mig"):
         _require_room_for_clients(homes, machine)
     return tuple(
-        Slice(gmi, layout.gpu_of(gmi), home.device, caps[gmi], memory[gmi], ())
+        Allocation(gmi, layout.gpu_of(gmi), home.device, caps[gmi], memory[gmi], ())
         for gmi, home in enumerate(homes)
     )
 

@@ -11,7 +11,7 @@ from typing import Final
 
 from gmijax.machine.jax_settings import without_breaking
 from gmijax.machine.xla_on_cpu import POOL, XLA_FLAGS, flags_on_cpu, pool_on_cpu
-from gmijax.partition.plan import Plan, Slice
+from gmijax.partition.plan import Allocation, Plan
 from gmijax.supervise.child import ENV_CPUS, ENV_GMI
 
 # The old and the new name of one JAX setting; JAX refuses to start when both are set.
@@ -44,27 +44,27 @@ def gmi_environment(
       cache_dir: compilation cache, unless the user has set one.
       backend_environment: what the backend adds.
     """
-    share = plan.slices[gmi]
+    allocation = plan.allocations[gmi]
     dropped = (_OLD_MEMORY_FRACTION, _MEMORY_FRACTION, _SM_PERCENT)
     kept = {k: value for k, value in without_breaking(inherited).items() if k not in dropped}
     # One thread beside a GPU: there the host only moves small arrays, and the GMIs of all GPUs
     # share the cores.
     defaults: dict[str, str] = {COMPILATION_CACHE: str(cache_dir)}
     for name in _THREAD_LIMITS:
-        defaults[name] = str(len(share.cpus) or 1)
+        defaults[name] = str(len(allocation.cpus) or 1)
     if plan.backend == "cpu":
-        own = _cpu(share, inherited.get(XLA_FLAGS, ""))
+        own = _cpu(allocation, inherited.get(XLA_FLAGS, ""))
     else:
-        own = _gpu(share)
+        own = _gpu(allocation)
         # All GMIs are on this host, and NCCL's sockets are open to whoever reaches them.
         defaults["NCCL_SOCKET_IFNAME"] = "lo"
-    return {**defaults, **kept, **own, **_common(share), **backend_environment}
+    return {**defaults, **kept, **own, **_common(allocation), **backend_environment}
 
 
-def _common(share: Slice) -> dict[str, str]:
+def _common(allocation: Allocation) -> dict[str, str]:
     return {
-        ENV_GMI: str(share.gmi),
-        ENV_CPUS: ",".join(map(str, share.cpus)),
+        ENV_GMI: str(allocation.gmi),
+        ENV_CPUS: ",".join(map(str, allocation.cpus)),
         "PYTHONUNBUFFERED": "1",
         # Every program is cached, also quick ones: all GMIs compile the same ones.
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -73,18 +73,18 @@ def _common(share: Slice) -> dict[str, str]:
     }
 
 
-def _cpu(share: Slice, users_flags: str) -> dict[str, str]:
-    pool = pool_on_cpu(len(share.cpus))
+def _cpu(allocation: Allocation, users_flags: str) -> dict[str, str]:
+    pool = pool_on_cpu(len(allocation.cpus))
     variables = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", POOL: str(pool)}
     if flags := flags_on_cpu(users_flags):
         variables[XLA_FLAGS] = flags
     return variables
 
 
-def _gpu(share: Slice) -> dict[str, str]:
-    variables = {"JAX_PLATFORMS": "cuda", "CUDA_VISIBLE_DEVICES": share.device}
-    if share.memory_fraction is not None:
-        variables[_MEMORY_FRACTION] = f"{share.memory_fraction:g}"
-    if share.sm_percent is not None:
-        variables[_SM_PERCENT] = f"{share.sm_percent:g}"
+def _gpu(allocation: Allocation) -> dict[str, str]:
+    variables = {"JAX_PLATFORMS": "cuda", "CUDA_VISIBLE_DEVICES": allocation.device}
+    if allocation.memory_fraction is not None:
+        variables[_MEMORY_FRACTION] = f"{allocation.memory_fraction:g}"
+    if allocation.sm_percent is not None:
+        variables[_SM_PERCENT] = f"{allocation.sm_percent:g}"
     return variables

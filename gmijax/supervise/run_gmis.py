@@ -140,12 +140,12 @@ def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:
 def taking_turns(launch: Launch, error: BackendUnavailable) -> Launch:
     """The job with the backend `share`, in its `plan.json` too; raises `error` if it may not."""
     plan = launch.plan
-    if not plan.may_share:
+    if not plan.allow_fallback:
         raise error
     warning = f"backend share: warning: {error}; so {WHAT_SHARE_LOSES}"
     launch.on_warning(warning)
     plan = dataclasses.replace(
-        plan, backend="share", may_share=False, reasons=(*plan.reasons, warning)
+        plan, backend="share", allow_fallback=False, reasons=(*plan.reasons, warning)
     )
     write_json(launch.run.plan, plan.to_dict())
     return dataclasses.replace(launch, plan=plan)

@@ -40,7 +40,7 @@ class Process(NamedTuple):
       name: of the job, in messages.
       arguments: of the command.
       log: file for what it prints; continued if it exists.
-      variables: environment variables beside those of this process, and those of its place.
+      variables: environment variables beside those of this process, and those of its slot.
       cwd: its working folder; None: that of this process.
       order: a file, and what the process finds in it.
       has_lifeline: whether its last argument is to be the number of a pipe that ends with this
@@ -69,7 +69,7 @@ class Child:
 
     Args:
       process: what is run.
-      variables: environment variables of its place.
+      variables: environment variables of its slot.
 
     Raises:
       GmijaxError: it cannot be started.

@@ -63,9 +63,9 @@ class JobEvents:
     def _changed(self, job: AnyJob, state: str) -> None:
         progress = job.progress
         if state == "running":
-            place = progress.place or None
+            slot = progress.slot or None
             more = {"attempt": progress.attempts, "note": progress.note}
-            self._write("job_started", job, overrides=dict(job.overrides), place=place, **more)
+            self._write("job_started", job, overrides=dict(job.overrides), slot=slot, **more)
             return
         event = "job_ended" if state in _ENDS else "job_waits"
         error, log = progress.error, str(self._paths.log(job.number))

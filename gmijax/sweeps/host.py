@@ -19,7 +19,7 @@ from gmijax.runs.held import try_lock
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.backends.backend import Backend
 from gmijax.sweeps.children import Child, Process, Seen
-from gmijax.sweeps.places import Place
+from gmijax.sweeps.slots import Slot
 
 Order = Literal["ask_to_stop", "kill", "close"]
 
@@ -27,7 +27,7 @@ Order = Literal["ask_to_stop", "kill", "close"]
 class Start(NamedTuple):
     """What is to be started where; see `Process`."""
 
-    place: Place
+    slot: Slot
     process: Process
 
 
@@ -64,7 +64,7 @@ class LocalHost:
         return None
 
     def open(self, plan: Plan, run: RunPaths) -> None:
-        """Enters the backend of a plan of places.
+        """Enters the backend of a plan of slots.
 
         Raises:
           BackendUnavailable: it cannot be had there.
@@ -79,16 +79,16 @@ class LocalHost:
         """
         assert self._backend is not None
         variables = (
-            client_variables(start.place, start.process, self._backend, self.machine)
+            client_variables(start.slot, start.process, self._backend, self.machine)
             if start.process.is_client
-            else variables_of(start.place, self._backend)
+            else variables_of(start.slot, self._backend)
         )
         child = Child(start.process, variables)
         self._backend.started(child.pid)
         self._num_started += 1
         self._children[self._num_started] = child
         if start.process.is_client:
-            self._clients[self._num_started] = start.place.slices[0].gmi
+            self._clients[self._num_started] = start.slot.allocations[0].gmi
         return self._num_started
 
     def look(self, child: int) -> Seen | None:
@@ -140,35 +140,35 @@ class LocalHost:
         self._leases.close()
 
 
-def variables_of(place: Place, backend: Backend) -> dict[str, str]:
-    """What tells a job at a place its GPUs, and the daemon of each; a dead daemon is renewed."""
-    if not place.devices:
+def variables_of(slot: Slot, backend: Backend) -> dict[str, str]:
+    """What tells a job at a slot its GPUs, and the daemon of each; a dead daemon is renewed."""
+    if not slot.devices:
         return {}
     daemons: dict[str, str] = {}
-    for share in place.slices:
-        backend.renew(share.gmi)
-        if pipe := backend.environment(share.gmi).get(PIPE_VARIABLE):
-            daemons[share.device] = pipe
-    devices = ",".join(place.devices)
+    for allocation in slot.allocations:
+        backend.renew(allocation.gmi)
+        if pipe := backend.environment(allocation.gmi).get(PIPE_VARIABLE):
+            daemons[allocation.device] = pipe
+    devices = ",".join(slot.devices)
     return {"CUDA_VISIBLE_DEVICES": devices, DAEMONS_VARIABLE: json.dumps(daemons)}
 
 
 def client_variables(
-    place: Place, process: Process, backend: Backend, machine: Machine
+    slot: Slot, process: Process, backend: Backend, machine: Machine
 ) -> dict[str, str]:
     """What tells a program of any kind its GPU, and its share of it; a dead daemon is renewed."""
-    if not place.devices:
+    if not slot.devices:
         return {}
-    share, device = place.slices[0], place.devices[0]
-    backend.renew(share.gmi)
-    variables = dict(backend.environment(share.gmi))
+    allocation, device = slot.allocations[0], slot.devices[0]
+    backend.renew(allocation.gmi)
+    variables = dict(backend.environment(allocation.gmi))
     # Many programs take numbers alone. Of a daemon of our own, which has one GPU, it is the first.
     gpu = next((gpu for gpu in machine.gpus if gpu.uuid == device), None)
-    if place.backend == "mps" and device in backend.daemons and machine.daemon_of(device) is None:
+    if slot.backend == "mps" and device in backend.daemons and machine.daemon_of(device) is None:
         variables["CUDA_VISIBLE_DEVICES"] = "0"
     else:
         variables["CUDA_DEVICE_ORDER"] = "PCI_BUS_ID"
         variables["CUDA_VISIBLE_DEVICES"] = device if gpu is None else str(gpu.index)
-    if place.backend == "mps" and process.memory_fraction is not None and gpu is not None:
+    if slot.backend == "mps" and process.memory_fraction is not None and gpu is not None:
         variables[MEMORY_LIMIT_VARIABLE] = f"0={int(process.memory_fraction * gpu.memory_mib)}M"
     return variables

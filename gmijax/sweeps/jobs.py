@@ -13,8 +13,8 @@ from gmijax.config.schema import flatten, to_dict
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.sweeps.kind import label_of
-from gmijax.sweeps.places import Place
 from gmijax.sweeps.progress import Progress, State
+from gmijax.sweeps.slots import Slot
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Job:
 
     @property
     def num_gpus(self) -> int:
-        """How many GPUs it takes a place on."""
+        """How many GPUs it takes a slot on."""
         return self.config.plan.num_gpus
 
     @property
@@ -75,7 +75,7 @@ def jobs_of(configs: Sequence[TrainConfig]) -> tuple[Job, ...]:
 
 
 def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
-    """Refuses jobs that say themselves where they run, or that no place is large enough for.
+    """Refuses jobs that say themselves where they run, or that no slot is large enough for.
 
     Raises:
       ConfigError: names the key.
@@ -102,14 +102,14 @@ def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
 
 
 def placed(
-    job: Job, run: RunPaths, place: Place, backend: BackendName | Literal["auto"]
+    job: Job, run: RunPaths, slot: Slot, backend: BackendName | Literal["auto"]
 ) -> TrainConfig:
-    """The configuration of a job in its run folder and its place."""
+    """The configuration of a job in its run folder and its slot."""
     wanted = job.config.plan
     plan = dataclasses.replace(
         wanted,
         backend=backend if wanted.backend == "auto" else wanted.backend,
-        memory_fraction=place.memory_fraction(job.config),
+        memory_fraction=slot.memory_fraction(job.config),
         # The daemon is the sweep's, and caps nobody.
         self_check="off" if wanted.self_check == "auto" else wanted.self_check,
     )

@@ -30,8 +30,8 @@ from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.packs import most_together
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Places, Site, gmis_of_place, places_of
 from gmijax.sweeps.scheduler import Scheduler
+from gmijax.sweeps.slots import Site, SlotPool, gmis_per_slot, plan_slots
 from gmijax.sweeps.study import Study
 from gmijax.sweeps.training import TrainingKind
 
@@ -93,7 +93,7 @@ def with_jobs_per_gpu(
 
 def _size(job: Job) -> tuple[int, int]:
     """GPUs of a job, and its GMIs on each."""
-    return job.num_gpus, gmis_of_place(job.config)
+    return job.num_gpus, gmis_per_slot(job.config)
 
 
 def _most(settings: SweepConfig, jobs: Sequence[Job], hosts: Sequence[Host]) -> int:
@@ -177,12 +177,12 @@ def _profile(
                 inner.handle(signal.SIGTERM)
 
         try:
-            plan = places_of(settings, host.machine, {job.config.plan.backend})
-            places = Places([Site(plan, host.machine)])
+            plan = plan_slots(settings, host.machine, {job.config.plan.backend})
+            slots = SlotPool([Site(plan, host.machine)])
             try:
                 host.open(plan, paths)
                 kind = TrainingKind(settings, paths)
-                Scheduler(jobs, Study[Job](), kind, settings, paths, places, [host], tick).run(
+                Scheduler(jobs, Study[Job](), kind, settings, paths, slots, [host], tick).run(
                     inner
                 )
             finally:

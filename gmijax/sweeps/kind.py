@@ -8,9 +8,9 @@ from typing import Any, NamedTuple, Protocol
 
 from gmijax.runs.folder import RunPaths
 from gmijax.sweeps.children import Process
-from gmijax.sweeps.places import Place
 from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.running import J, Outcome, Running
+from gmijax.sweeps.slots import Slot
 
 
 class AnyJob(Protocol):
@@ -38,7 +38,7 @@ class AnyJob(Protocol):
 
     @property
     def num_gpus(self) -> int:
-        """How many GPUs it takes a place on."""
+        """How many GPUs it takes a slot on."""
         ...
 
     @property
@@ -82,7 +82,7 @@ class Kind(Protocol[J]):
         """The job, and those in the queue that may run in one process with it."""
         ...
 
-    def start(self, jobs: tuple[J, ...], place: Place) -> Start:
+    def start(self, jobs: tuple[J, ...], slot: Slot) -> Start:
         """What runs them there."""
         ...
 

@@ -131,7 +131,7 @@ def nodes_of(
       cluster: where they are.
       settings: of the jobs.
       on_cpu: whether no job wants a GPU.
-      processes: of the largest job at each of its places, for which there must be CPUs.
+      processes: of the largest job at each of its slots, for which there must be CPUs.
       root: their folder, which may not be there yet.
 
     Raises:

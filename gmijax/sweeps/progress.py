@@ -35,7 +35,7 @@ class Progress:
       ended_s: when it ended after that.
       earlier_s: seconds that it took, where an earlier command has completed it.
       earlier_steps_per_s: its mean rate then, where that is known.
-      place: GPUs and places where it runs, in words.
+      slot: GPUs and slots where it runs, in words.
       node: address of the node where it runs or ran last; None: this machine.
       attempts: how often this command has started it.
       exit_code: of its process, once that has ended; negative for the signal that ended it.
@@ -60,7 +60,7 @@ class Progress:
     ended_s: float | None = None
     earlier_s: float = 0.0
     earlier_steps_per_s: float | None = None
-    place: str = ""
+    slot: str = ""
     node: str | None = None
     attempts: int = 0
     exit_code: int | None = None
@@ -98,10 +98,10 @@ class Progress:
         self.earlier_steps_per_s = rate if isinstance(rate, float) else None
         self.exit_code = 0
 
-    def begin(self, place: str, node: str | None) -> None:
+    def begin(self, slot: str, node: str | None) -> None:
         """Its process was started there."""
         self.note, self.error = self.error, None  # Why it runs again, if it does.
-        self.state, self.place, self.node = "running", place, node
+        self.state, self.slot, self.node = "running", slot, node
         self.attempts += 1
         self.started_s, self.updated_s, self.ended_s = time.monotonic(), None, None
         self.reports, self.reported_s, self.exit_code = 0, None, None

@@ -24,9 +24,9 @@ from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.kind import J
 from gmijax.sweeps.nodes import Host, nodes_of
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Places, Site
 from gmijax.sweeps.report import Report
 from gmijax.sweeps.scheduler import Scheduler
+from gmijax.sweeps.slots import Site, SlotPool
 from gmijax.sweeps.study import OptunaStudy, Study, optuna_package
 from gmijax.sweeps.view import SweepView
 from gmijax.sweeps.words import announce, print_outcome
@@ -143,8 +143,8 @@ def _train(
             held.callback(host.shut)
             host.open(site.plan, paths.node(number) if host.name else paths)
         held.enter_context(view)
-        places = Places(sites)
-        limiter = work.limiter(places, sites, hosts, console)
+        slots = SlotPool(sites)
+        limiter = work.limiter(slots, sites, hosts, console)
 
         def tick() -> None:
             report.update()
@@ -157,7 +157,7 @@ def _train(
             work.kind(paths, sites),
             work.ranking,
             paths,
-            places,
+            slots,
             hosts,
             tick,
             limiter,
@@ -183,14 +183,14 @@ def _lease(
     console: Console,
     signals: StopSignals,
 ) -> None:
-    """Holds the GPUs of all places; waits for those that another sweep has.
+    """Holds the GPUs of all slots; waits for those that another sweep has.
 
     Raises:
       JobInterrupted: a signal came.
     """
     # In one order, so that two sweeps do not wait for each other.
     for host, site in sorted(zip(hosts, sites, strict=True), key=lambda both: both[0].name or ""):
-        devices = {share.device for share in site.plan.slices} - {"cpu"}
+        devices = {allocation.device for allocation in site.plan.allocations} - {"cpu"}
         told = None
         while (other := host.lease(devices)) is not None:
             if other != told:

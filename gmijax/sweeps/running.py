@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 from gmijax.clock import running_s
 from gmijax.sweeps.children import Seen
 from gmijax.sweeps.nodes import Host
-from gmijax.sweeps.places import Place
+from gmijax.sweeps.slots import Slot
 
 if TYPE_CHECKING:
     from gmijax.sweeps.kind import AnyJob, Reader
@@ -44,7 +44,7 @@ class Running(Generic[J]):
 
     Attributes:
       jobs: what it runs.
-      place: where.
+      slot: where.
       host: the machine.
       child: its number there.
       readers: of their metrics.
@@ -58,7 +58,7 @@ class Running(Generic[J]):
     """
 
     jobs: tuple[J, ...]
-    place: Place
+    slot: Slot
     host: Host
     child: int
     readers: tuple[Reader, ...]

@@ -1,4 +1,4 @@
-"""Runs jobs of any kind, as many at a time as there are places."""
+"""Runs jobs of any kind, as many at a time as there are slots."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from gmijax.sweeps.host import Start
 from gmijax.sweeps.kind import J, Kind, Limiter
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Place, Places
 from gmijax.sweeps.running import Outcome, Running
+from gmijax.sweeps.slots import Slot, SlotPool
 from gmijax.sweeps.study import Study
 
 _TICK_S = 0.1
@@ -45,10 +45,10 @@ class Scheduler(Generic[J]):
       kind: of all jobs.
       ranking: what they are compared by.
       paths: their files.
-      places: of the jobs.
-      hosts: machines of the places, in that order; opened.
+      slots: of the jobs.
+      hosts: machines of the slots, in that order; opened.
       on_tick: called ten times a second.
-      limiter: changes how many run at once; None: as many as there are places.
+      limiter: changes how many run at once; None: as many as there are slots.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Scheduler(Generic[J]):
         kind: Kind[J],
         ranking: Ranking,
         paths: SweepPaths,
-        places: Places,
+        slots: SlotPool,
         hosts: Sequence[Host],
         on_tick: Callable[[], None],
         limiter: Limiter[J] | None = None,
@@ -66,7 +66,7 @@ class Scheduler(Generic[J]):
         self._jobs, self._study = jobs, study
         self._queue = [job for job in jobs if job.progress.state == "waiting"]
         self._kind, self._ranking, self._paths = kind, ranking, paths
-        self._places, self._hosts, self._on_tick = places, hosts, on_tick
+        self._slots, self._hosts, self._on_tick = slots, hosts, on_tick
         self._limiter = limiter
         self._alone: set[int] = set()
         self._faults: Counter[int] = Counter()
@@ -92,7 +92,7 @@ class Scheduler(Generic[J]):
                 if self._unwritten is not None:
                     raise self._unwritten
                 self._retract()
-                if not self._places.left:
+                if not self._slots.left:
                     raise NodeLost(f"no node is left: {self._hosts[-1].lost}")
                 self._start_what_fits()
                 self._on_tick()
@@ -114,26 +114,26 @@ class Scheduler(Generic[J]):
                 continue
             if not self._sites_to_avoid(job):
                 return  # In order, so that a large job is not passed by forever.
-        while not self._queue and self._places.has_room() and (job := self._study.next()):
+        while not self._queue and self._slots.has_free_slot() and (job := self._study.next()):
             self._jobs.append(job)
             if not self._start_if_it_fits(job):
                 self._queue.append(job)
 
     def _start_if_it_fits(self, job: J) -> bool:
         avoid = self._sites_to_avoid(job)
-        if not (num_gpus := self._places.num_gpus_with_room(avoid)):
+        if not (num_gpus := self._slots.num_gpus_with_free_slot(avoid)):
             return False
         together = self._kind.together(job, self._queue, self._alone)
-        place = self._places.take(
+        slot = self._slots.acquire(
             job.num_gpus,
             alone=job.number in self._alone,
             avoid=avoid,
             num_jobs=-(-len(together) // num_gpus),  # So that every GPU gets its part of them.
         )
-        if place is None:
+        if slot is None:
             return False
         try:
-            self._start(together[: place.size], place)
+            self._start(together[: slot.size], slot)
         except NodeLost:
             self._drop_lost()
             return False
@@ -147,17 +147,17 @@ class Scheduler(Generic[J]):
             if program == job.program and number is not None
         }
 
-    def _start(self, jobs: tuple[J, ...], place: Place) -> None:
-        host, first = self._hosts[place.site], jobs[0]
-        start = self._kind.start(jobs, place)
+    def _start(self, jobs: tuple[J, ...], slot: Slot) -> None:
+        host, first = self._hosts[slot.site], jobs[0]
+        start = self._kind.start(jobs, slot)
         for job in jobs:
             job.progress.read(self._paths.job(job.number), self._ranking)
-        child = host.start(Start(place, start.process))
+        child = host.start(Start(slot, start.process))
         if start.is_awaited:
-            self._awaited.setdefault((place.site, first.program), first.number)
-        self._running[first.number] = Running(jobs, place, host, child, start.readers)
+            self._awaited.setdefault((slot.site, first.program), first.number)
+        self._running[first.number] = Running(jobs, slot, host, child, start.readers)
         for job in jobs:
-            job.progress.begin(place.label, host.name)
+            job.progress.begin(slot.label, host.name)
         self._queue = [job for job in self._queue if job.progress.state == "waiting"]
 
     def _look(self) -> None:
@@ -195,7 +195,7 @@ class Scheduler(Generic[J]):
         ends = [self._kind.outcome(running, job) for job in running.jobs]
         exit_code = (running.look() or Seen(None)).exit_code
         running.host.order(running.child, "close")
-        self._places.give_back(running.place)
+        self._slots.release(running.slot)
         self._nobody_waits_for(running)
         again = [
             job
@@ -211,7 +211,7 @@ class Scheduler(Generic[J]):
         """Notes how a job has ended; whether it is to run again."""
         run, progress = self._paths.job(job.number), job.progress
         progress.read(run, self._ranking)
-        progress.place, progress.error, progress.ended_s = "", end.error, time.monotonic()
+        progress.slot, progress.error, progress.ended_s = "", end.error, time.monotonic()
         progress.exit_code = exit_code
         progress.state = "failed" if end.error else "completed"
         if running.is_retracted and (end.is_interrupted or end.error) and not running.is_killed:
@@ -244,7 +244,7 @@ class Scheduler(Generic[J]):
 
     def _why_again(self, running: Running[J], job: J, end: Outcome) -> str | None:
         """Why a job that failed runs once more, if that may help."""
-        error, is_shared = end.error or "", not running.place.is_alone
+        error, is_shared = end.error or "", not running.slot.is_alone
         if end.is_out_of_memory and self._limiter and self._limiter.forbid(running, error):
             return f"again, beside fewer others, after {error}"
         # The fault may be that of another client of its daemon.
@@ -263,14 +263,14 @@ class Scheduler(Generic[J]):
     def _nobody_waits_for(self, running: Running[J]) -> None:
         """Its metrics are there, or it has ended, perhaps before it had compiled."""
         first = running.jobs[0]
-        key = running.place.site, first.program
+        key = running.slot.site, first.program
         if self._awaited.get(key) == first.number:
             self._awaited[key] = None
 
     def _drop_lost(self) -> None:
-        for site in list(self._places.left):
+        for site in list(self._slots.left):
             if self._hosts[site].lost is not None:
-                self._places.drop(site)
+                self._slots.remove_site(site)
 
     def _stop(self, signals: StopSignals) -> None:
         """Asks all jobs to save and end; the same signal again ends them at once."""

@@ -32,7 +32,7 @@ class Study(Generic[J]):
         return None
 
     def is_hopeless(self, job: J) -> bool:
-        """Whether a job that runs should give its place to another one."""
+        """Whether a job that runs should give its slot to another one."""
         del job
         return False
 
@@ -110,13 +110,13 @@ class OptunaStudy(Study[J]):
             return False  # It has ended before, and goes on for more steps.
         if not job.num_timesteps:
             return False  # Nobody knows how far it is.
-        place = _REPORTS * progress.env_steps // job.num_timesteps
-        if progress.value is None or place <= self._reported.get(job.number, 0):
+        report = _REPORTS * progress.env_steps // job.num_timesteps
+        if progress.value is None or report <= self._reported.get(job.number, 0):
             return False
         if not progress.is_full:
             return False  # It cannot be compared yet.
-        self._reported[job.number] = place
-        trial.report(progress.value, place)
+        self._reported[job.number] = report
+        trial.report(progress.value, report)
         return trial.should_prune()
 
     def tell(self, job: J) -> None:

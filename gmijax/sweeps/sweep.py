@@ -25,9 +25,9 @@ from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.objective import why_not_comparable, with_objective
 from gmijax.sweeps.packs import require_packable
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Site, gmis_of_place, places_of
 from gmijax.sweeps.progress import State
 from gmijax.sweeps.runner import SweepResult, run_work
+from gmijax.sweeps.slots import Site, gmis_per_slot, plan_slots
 from gmijax.sweeps.space import Space
 from gmijax.sweeps.study import MakeJob
 from gmijax.sweeps.training import TrainingKind
@@ -54,7 +54,7 @@ class SweepWork(Work[Job]):
     @property
     def processes(self) -> int:
         """See `Work`."""
-        return max((gmis_of_place(job.config) for job in self.jobs), default=1)
+        return max((gmis_per_slot(job.config) for job in self.jobs), default=1)
 
     def paths(self, root: Path) -> SweepPaths:
         """See `Work`."""
@@ -64,7 +64,7 @@ class SweepWork(Work[Job]):
         """See `Work`."""
         backends = {job.config.plan.backend for job in self.jobs}
         return [
-            Site(places_of(self.settings, host.machine, backends), host.machine, host.name)
+            Site(plan_slots(self.settings, host.machine, backends), host.machine, host.name)
             for host in hosts
         ]
 

@@ -18,8 +18,8 @@ from gmijax.sweeps.jobs import Job, placed
 from gmijax.sweeps.kind import Start
 from gmijax.sweeps.packs import Packer, own_end
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Place
 from gmijax.sweeps.running import Outcome, Running
+from gmijax.sweeps.slots import Slot
 
 MODULE: Final = "gmijax.workers.training_job"
 
@@ -46,20 +46,20 @@ class TrainingKind:
         """See `Kind`."""
         return self._packer.together(job, queue, alone)
 
-    def start(self, jobs: tuple[Job, ...], place: Place) -> Start:
+    def start(self, jobs: tuple[Job, ...], slot: Slot) -> Start:
         """See `Kind`."""
         # Alone on a GPU a job does as it would without a sweep.
-        backend = "auto" if place.is_whole_gpu else place.backend
+        backend = "auto" if slot.is_whole_gpu else slot.backend
         first, runs = jobs[0], [self._paths.job(job.number) for job in jobs]
         configs = [
-            to_dict(placed(job, run, place, backend)) for job, run in zip(jobs, runs, strict=True)
+            to_dict(placed(job, run, slot, backend)) for job, run in zip(jobs, runs, strict=True)
         ]
         order = self._paths.order(first.number)
         process = Process(
             f"job {order.stem}",
             tuple(command(MODULE, str(order))),
             self._paths.log(first.number),
-            order=(order, {"configs": configs, "cpus": list(place.cpus)}),
+            order=(order, {"configs": configs, "cpus": list(slot.cpus)}),
             has_lifeline=True,
         )
         readers = tuple(MetricsReader(run.metrics) for run in runs)
@@ -99,7 +99,7 @@ class TrainingKind:
     def _failed(
         self, running: Running[Job], job: Job, error: str, *, is_fault: bool = False
     ) -> Outcome:
-        others = running.place.backend in _ENDED_BY_GPU and may_be_anothers(error)
+        others = running.slot.backend in _ENDED_BY_GPU and may_be_anothers(error)
         again = others and self.max_restarts(job) > 0
         return Outcome(error=error, is_fault=is_fault, may_be_anothers=again)
 

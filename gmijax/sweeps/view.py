@@ -15,7 +15,7 @@ from gmijax.sweeps.kind import AnyJob, label_of, trainings_per_hour
 from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import shown
 
-_WHERE = "GPU and place"
+_WHERE = "GPU and slot"
 _HEADINGS = ("job", "overrides", _WHERE, "progress", "steps/s", "{}", "ranked by", "ETA", "state")
 _MOST_ROWS = 30
 _BAR_WIDTH = 6
@@ -76,7 +76,7 @@ class SweepView:
     def _change(self, job: AnyJob, progress: Progress) -> str:
         what = f"{' '.join(filter(None, ('job', str(job.number), job.label)))}: {progress.state}"
         if progress.state == "running":
-            where = f" on {progress.place}" if progress.place else ""
+            where = f" on {progress.slot}" if progress.slot else ""
             return f"{what}{where}{f' ({progress.note})' if progress.note else ''}"
         if progress.error:
             return f"{what}: {progress.error}"
@@ -87,7 +87,7 @@ class SweepView:
     def _table(self) -> Table:
         table = Table(box=None, pad_edge=False)
         headings = list(_HEADINGS)
-        if not (has_places := any(job.progress.place for job in self._jobs)):
+        if not (has_slots := any(job.progress.slot for job in self._jobs)):
             headings.remove(_WHERE)  # On one machine without GPUs.
         for heading in headings:
             name = heading.format(self._ranking.objective)
@@ -98,7 +98,7 @@ class SweepView:
         names = _short_names(self._jobs)
         for job in rows[:_MOST_ROWS]:
             label = label_of({names[key]: value for key, value in job.overrides.items()})
-            table.add_row(*_row(job, job.progress, label, has_places=has_places))
+            table.add_row(*_row(job, job.progress, label, has_slots=has_slots))
         if len(rows) > _MOST_ROWS:
             table.add_row("", f"and {len(rows) - _MOST_ROWS} more")
         return table
@@ -118,7 +118,7 @@ def _short_names(jobs: Sequence[AnyJob]) -> dict[str, str]:
 
 
 def _row(
-    job: AnyJob, progress: Progress, label: str, *, has_places: bool
+    job: AnyJob, progress: Progress, label: str, *, has_slots: bool
 ) -> tuple[str | Text, ...]:
     total, rate = job.num_timesteps, progress.env_steps_per_s
     part = min(progress.env_steps / total, 1.0) if total else None
@@ -131,7 +131,7 @@ def _row(
         str(job.number),
         # As text: overrides and errors may look like markup.
         Text(label),
-        *((progress.place,) if has_places else ()),
+        *((progress.slot,) if has_slots else ()),
         Text(done.strip()) if part is None else Text.assemble(bar(part, _BAR_WIDTH), done),
         f"{rate:,.0f}" if rate else "",
         "" if progress.latest is None else f"{progress.latest:.4g}",

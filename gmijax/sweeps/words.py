@@ -11,8 +11,8 @@ from gmijax.config.sweep import Ranking
 from gmijax.control.console import nearby, print_reasons
 from gmijax.sweeps.kind import J
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Site
 from gmijax.sweeps.report import tables
+from gmijax.sweeps.slots import Site
 from gmijax.sweeps.work import Work
 
 
@@ -26,15 +26,15 @@ def announce(
 
     Args:
       console: where it is said.
-      sites: machines and their places.
+      sites: machines and their slots.
       work: the jobs, and where they come from.
       num_complete: jobs that an earlier command has completed.
     """
     settings = work.settings
     total = len(work.jobs) if settings.sampler == "grid" else settings.trials or 0
     more = f", {num_complete} of them complete already" if num_complete else ""
-    places = sum(len(site.plan.slices) for site in sites)
-    at_once = f"at most {places}" if work.is_adaptive and sites[0].machine.gpus else str(places)
+    slots = sum(len(site.plan.allocations) for site in sites)
+    at_once = f"at most {slots}" if work.is_adaptive and sites[0].machine.gpus else str(slots)
     console.print(f"{_counted(total, 'job')}{more}, {at_once} at a time {_where(sites)}")
     print_reasons(console, [reason for site in sites for reason in site.plan.reasons])
     for warning in work.warnings(sites):

@@ -17,8 +17,8 @@ from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps.kind import J, Kind, Limiter
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Places, Site
 from gmijax.sweeps.progress import State
+from gmijax.sweeps.slots import Site, SlotPool
 from gmijax.sweeps.space import Space
 from gmijax.sweeps.study import MakeJob
 
@@ -74,7 +74,7 @@ class Work(ABC, Generic[J]):
     @property
     @abstractmethod
     def processes(self) -> int:
-        """Of the largest job at each of its places."""
+        """Of the largest job at each of its slots."""
 
     @abstractmethod
     def paths(self, root: Path) -> SweepPaths:
@@ -82,7 +82,7 @@ class Work(ABC, Generic[J]):
 
     @abstractmethod
     def sites(self, hosts: Sequence[Host]) -> list[Site]:
-        """Places for the jobs.
+        """Slots for the jobs.
 
         Raises:
           ConfigError: there are no such GPUs, or no room for so many jobs.
@@ -111,10 +111,10 @@ class Work(ABC, Generic[J]):
         """What the scheduler asks."""
 
     def limiter(
-        self, places: Places, sites: Sequence[Site], hosts: Sequence[Host], console: Console
+        self, slots: SlotPool, sites: Sequence[Site], hosts: Sequence[Host], console: Console
     ) -> Limiter[J] | None:
         """What changes the number of jobs at once; None: nothing does."""
-        del places, sites, hosts, console
+        del slots, sites, hosts, console
         return None
 
     @abstractmethod

@@ -133,7 +133,7 @@ def test_capped_gmis_check_their_products_and_train(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     plan = json.loads((tmp_path / "run" / "plan.json").read_text())
     assert plan["self_check"]
-    assert [share["sm_percent"] for share in plan["slices"]] == [50.0, 25.0]
+    assert [allocation["sm_percent"] for allocation in plan["allocations"]] == [50.0, 25.0]
 
 
 def test_the_doctor_finds_gpu_and_mps_usable(tmp_path: Path) -> None:

@@ -202,7 +202,11 @@ def test_gmis_that_share_a_mig_instance_get_a_daemon_for_it(mps: FakeMps, run: R
     divided = gpu(0, mig_enabled=True)._replace(instances=instances)
     here = machine(1, gpus=(divided,), mps_control=mps.program, operator_daemon=Path("/other"))
     plan = planned(here, gmis_per_gpu=3, backend="mig")
-    assert [share.device for share in plan.slices] == ["MIG-large", "MIG-small", "MIG-large"]
+    assert [allocation.device for allocation in plan.allocations] == [
+        "MIG-large",
+        "MIG-small",
+        "MIG-large",
+    ]
     directories = train_and_stop(run, here, plan, ["mps_client", "train", "mps_client"])
     assert directories[0] == directories[2] != directories[1]
     assert [device for device, _ in mps.told("start")] == ["MIG-large"]

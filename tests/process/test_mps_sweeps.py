@@ -21,8 +21,8 @@ from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps.host import LocalHost, variables_of
 from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.scheduler import Scheduler
+from gmijax.sweeps.slots import Site, SlotPool, plan_slots
 from gmijax.sweeps.study import Study
 from gmijax.sweeps.training import TrainingKind
 
@@ -42,13 +42,13 @@ def test_a_fatal_fault_ends_one_job_of_a_sweep_and_its_neighbours_go_on(
     here = machine(2, mps_control=mps.program)
     jobs = list(jobs_of([compose(f"seed={n}") for n in range(6)]))
     settings, paths = SweepConfig(jobs_per_gpu=3, objective="return"), SweepPaths(tmp_path)
-    plan = places_of(settings, here, {"auto"})
+    plan = plan_slots(settings, here, {"auto"})
     with closing(LocalHost(here)) as host:
         host.open(plan, paths)
-        places = Places([Site(plan, here)])
+        slots = SlotPool([Site(plan, here)])
         kind = TrainingKind(settings, paths)
         scheduler = Scheduler(
-            jobs, Study[Job](), kind, settings, paths, places, [host], lambda: None
+            jobs, Study[Job](), kind, settings, paths, slots, [host], lambda: None
         )
         scheduler.run(StopSignals())
     states = [job.progress.state for job in jobs]
@@ -65,14 +65,14 @@ def test_a_job_with_several_gpus_uses_the_daemons_of_its_sweep(
     mps: FakeMps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     here = machine(2, mps_control=mps.program)
-    plan = places_of(SweepConfig(jobs_per_gpu=2), here, {"auto"})
+    plan = plan_slots(SweepConfig(jobs_per_gpu=2), here, {"auto"})
     paths, run = SweepPaths(tmp_path / "sweep"), RunPaths(tmp_path / "run")
     monkeypatch.setattr("gmijax.machine.snapshot.list_gpus", lambda: here.gpus)
     with open_backend(plan, here, paths) as backend:
-        place = Places([Site(plan, here)]).take(2)
-        assert place is not None
-        assert place.label == "GPU 0 place 0, GPU 1 place 0"
-        for name, value in variables_of(place, backend).items():
+        slot = SlotPool([Site(plan, here)]).acquire(2)
+        assert slot is not None
+        assert slot.label == "GPU 0 slot 0, GPU 1 slot 0"
+        for name, value in variables_of(slot, backend).items():
             monkeypatch.setenv(name, value)
         of_job = detect_machine()
         assert [gpu.uuid for gpu in of_job.gpus] == [gpu(0).uuid, gpu(1).uuid]
@@ -82,7 +82,7 @@ def test_a_job_with_several_gpus_uses_the_daemons_of_its_sweep(
         assert (len(mps.told("start")), len(mps.told("quit"))) == (2, 0)
 
         MpsControl(mps.program, Path(directories[1])).quit()
-        again = json.loads(variables_of(place, backend)[DAEMONS_VARIABLE])
+        again = json.loads(variables_of(slot, backend)[DAEMONS_VARIABLE])
         assert again[gpu(0).uuid] == directories[0]
         assert MpsControl(mps.program, Path(again[gpu(1).uuid])).is_answering()
     assert not mps.left()

@@ -154,7 +154,10 @@ def test_one_gpu_of_each_kind_is_profiled(overrides: tuple[str, ...], layout: st
 def test_profiled_are_gpus_of_the_job():
     workload = A3cWorkload(wanted("plan.serving_gpus=[2,3]", "plan.training_gpus=[1]"))
     plan = workload.plan_at(Point(1, 64, "jax", 2), machine(4))
-    used = {share.device: role for share, role in zip(plan.slices, plan.roles, strict=True)}
+    used = {
+        allocation.device: role
+        for allocation, role in zip(plan.allocations, plan.roles, strict=True)
+    }
     assert used == {gpu(1).uuid: "trainer", gpu(2).uuid: "simulator+agent"}
     assert workload.plan.num_gpus == 3
 

@@ -65,7 +65,7 @@ def test_backend_by_need(
 
 def test_mig_serves_on_the_gpus_that_have_instances(monkeypatch: pytest.MonkeyPatch):
     plan = planned(monkeypatch, (H200_MIG_OFF, H200_MIG_EMPTY, A100_SEVEN), make=SERVE)
-    assert [share.device for share in plan.slices] == [
+    assert [allocation.device for allocation in plan.allocations] == [
         fake_nvml.instance_uuid(0, place) for place in (0, 1)
     ]
     assert "GPUs [2]: not [0], which have no MIG instance" in plan.reasons
@@ -73,7 +73,7 @@ def test_mig_serves_on_the_gpus_that_have_instances(monkeypatch: pytest.MonkeyPa
 
 def test_one_serving_gmi_takes_a_whole_gpu(monkeypatch: pytest.MonkeyPatch):
     plan = planned(monkeypatch, (A100_SEVEN, H200_MIG_OFF), make=SERVE, gmis_per_gpu=1)
-    assert (plan.backend, plan.slices[0].device) == ("share", "GPU-1-uuid")
+    assert (plan.backend, plan.allocations[0].device) == ("share", "GPU-1-uuid")
     assert "nothing to share" in plan.reasons[0]
 
 
@@ -107,4 +107,4 @@ def test_gpus_that_cannot_be_used_so_are_refused(
 def test_what_may_fall_back_to_taking_turns(
     monkeypatch: pytest.MonkeyPatch, boards: tuple[Board, ...], changes: dict[str, Any], may: bool
 ):
-    assert planned(monkeypatch, boards, **changes).may_share == may
+    assert planned(monkeypatch, boards, **changes).allow_fallback == may

@@ -170,7 +170,7 @@ def test_a_complete_run_with_damaged_files_is_one_line(run: RunPaths):
         with pytest.raises(ConfigError, match=f"^{run.summary}: broken"):
             _finished(config_of(run), run, open_console(show=False))
     run.summary.unlink()
-    for plan in ({}, {"layout": 5}, {"layout": [[0]], "slices": [{}]}, {"layout": [["a"]]}):
+    for plan in ({}, {"layout": 5}, {"layout": [[0]], "allocations": [{}]}, {"layout": [["a"]]}):
         write_json(run.plan, plan)
         with pytest.raises(ConfigError, match=f"^{run.plan}: (not a )?plan") as error:
             _finished(config_of(run), run, open_console(show=False))

@@ -28,8 +28,8 @@ from gmijax.packs.pack import PackWork
 from gmijax.supervise.backends.backend import Backend
 from gmijax.sweeps.children import Process, Seen
 from gmijax.sweeps.host import LocalHost, client_variables
-from gmijax.sweeps.places import Place, Places
 from gmijax.sweeps.running import Outcome, Running
+from gmijax.sweeps.slots import Slot, SlotPool
 from gmijax.sweeps.work import Folder
 
 COMMAND = ("true", "--seed", "{seed}")
@@ -154,19 +154,19 @@ class Placed(Backend):
         return {PIPE_VARIABLE: str(self._pipe or "/none")}
 
 
-def place_of(*words: str) -> tuple[PackWork, Place]:
+def place_of(*words: str) -> tuple[PackWork, Slot]:
     work = build_pack(["pack.copies=2", "pack.jobs_per_gpu=2", *words], ["true"])
     with closing(LocalHost(GPU)) as host:
         (site,) = work.sites([host])
-    place = Places([site]).take(1)
-    assert place is not None
-    return work, place
+    slot = SlotPool([site]).acquire(1)
+    assert slot is not None
+    return work, slot
 
 
 def test_a_client_of_the_own_daemon_gets_the_first_gpu_and_its_part_of_the_memory() -> None:
-    _, place = place_of()
+    _, slot = place_of()
     process = Process("job", ("true",), Path("log"), is_client=True, memory_fraction=0.5)
-    found = client_variables(place, process, Placed(Path("/pipe")), GPU)
+    found = client_variables(slot, process, Placed(Path("/pipe")), GPU)
     assert found[PIPE_VARIABLE] == "/pipe"
     # Of the daemon's one GPU; programs that take numbers alone do not know its UUID.
     assert found["CUDA_VISIBLE_DEVICES"] == "0"
@@ -174,9 +174,9 @@ def test_a_client_of_the_own_daemon_gets_the_first_gpu_and_its_part_of_the_memor
 
 
 def test_jobs_that_take_turns_get_the_index_of_their_gpu() -> None:
-    _, place = place_of("pack.backend=share")
+    _, slot = place_of("pack.backend=share")
     process = Process("job", ("true",), Path("log"), is_client=True, memory_fraction=0.5)
-    found = client_variables(place, process, Placed(None), GPU)
+    found = client_variables(slot, process, Placed(None), GPU)
     assert found["CUDA_VISIBLE_DEVICES"] == str(GPU.gpus[0].index)
     assert found["CUDA_DEVICE_ORDER"] == "PCI_BUS_ID"
     assert MEMORY_LIMIT_VARIABLE not in found
@@ -193,25 +193,25 @@ def test_others_wait_for_the_first_job_of_a_program_until_one_has_reported(
     kind: CommandKind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
-    _, place = place_of()
+    _, slot = place_of()
     job, other = CommandJob(0, {}, ("true", "{job}")), CommandJob(1, {}, ("false",))
-    start = kind.start((job,), place)
+    start = kind.start((job,), slot)
     assert start.is_awaited
     with start.process.log.open("a") as log:
         log.write("6400: reward=12.500\n7000: reward=13.000\n")
     assert start.readers[0].new()
-    assert not kind.start((job,), place).is_awaited  # In later packs too.
-    assert kind.start((other,), place).is_awaited
+    assert not kind.start((job,), slot).is_awaited  # In later packs too.
+    assert kind.start((other,), slot).is_awaited
 
 
 def test_a_job_that_is_started_again_gets_the_words_to_resume(
     kind: CommandKind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MKL_NUM_THREADS", "7")
-    _, place = place_of()
+    _, slot = place_of()
     job = CommandJob(3, {}, ("true", "{job}"))
-    first = kind.start((job,), place).process
-    before = kind.start((job,), place).process
+    first = kind.start((job,), slot).process
+    before = kind.start((job,), slot).process
     assert before.arguments == ("true", "003")  # It has not reported: nothing can be saved.
     (tmp_path / "003" / "pack" / "metrics.jsonl").write_text('{"env_steps": 1}\n')
     assert first.arguments == ("true", "003")
@@ -220,7 +220,7 @@ def test_a_job_that_is_started_again_gets_the_words_to_resume(
     assert first.variables["NAME"] == "pack003"
     assert first.variables["OMP_NUM_THREADS"] == "4"
     assert "MKL_NUM_THREADS" not in first.variables  # The user has said it.
-    again = kind.start((job,), place).process
+    again = kind.start((job,), slot).process
     assert again.arguments == ("true", "003", "--resume", f"{tmp_path}/003/last")
     assert (tmp_path / "003" / "pack" / "output.log").read_text().splitlines() == [
         "$ true 003",
@@ -243,16 +243,16 @@ class Ended(LocalHost):
 def test_of_jobs_that_a_gpu_fault_ended_the_first_runs_alone(kind: CommandKind) -> None:
     work = build_pack(["pack.copies=4", "pack.jobs_per_gpu=4"], ["true"])
     host = Ended()
-    places = Places(work.sites([host]))
+    slots = SlotPool(work.sites([host]))
 
     def fail(job: CommandJob) -> Outcome:
-        place = places.take(1)
-        assert place is not None
-        log = kind.start((job,), place).process.log
+        slot = slots.acquire(1)
+        assert slot is not None
+        log = kind.start((job,), slot).process.log
         with log.open("a") as file:
             file.write("RuntimeError: CUDA error: an illegal memory access was encountered\n")
-        places.give_back(place)
-        return kind.outcome(Running((job,), place, host, 0, ()), job)
+        slots.release(slot)
+        return kind.outcome(Running((job,), slot, host, 0, ()), job)
 
     ends = [fail(job) for job in work.jobs[:3]]
     assert [end.may_be_anothers for end in ends] == [True, False, False]
@@ -264,14 +264,14 @@ def test_of_jobs_that_a_gpu_fault_ended_the_first_runs_alone(kind: CommandKind) 
 def test_a_job_that_finds_no_checkpoint_starts_from_its_beginning(
     kind: CommandKind, tmp_path: Path
 ) -> None:
-    _, place = place_of()
+    _, slot = place_of()
     job, host = CommandJob(0, {}, ("true",)), Ended()
-    kind.start((job,), place)
+    kind.start((job,), slot)
     (tmp_path / "000" / "pack" / "metrics.jsonl").write_text('{"env_steps": 1}\n')
-    assert "--resume" in kind.start((job,), place).process.arguments
-    end = kind.outcome(Running((job,), place, host, 0, ()), job)
+    assert "--resume" in kind.start((job,), slot).process.arguments
+    end = kind.outcome(Running((job,), slot, host, 0, ()), job)
     assert end.again == "from its beginning"
-    assert "--resume" not in kind.start((job,), place).process.arguments
+    assert "--resume" not in kind.start((job,), slot).process.arguments
 
 
 @pytest.mark.parametrize(
@@ -324,17 +324,17 @@ class Packed:
         work = build_pack(["pack.copies=16"], ["true"])
         self.host = Gpu()
         sites = work.sites([self.host])
-        self.places = Places(sites)
-        self.crowd = Crowd(self.places, sites, [self.host], open_console(show=False))
+        self.slots = SlotPool(sites)
+        self.crowd = Crowd(self.slots, sites, [self.host], open_console(show=False))
         self.queue = list(work.jobs)
         self.running: list[Running[CommandJob]] = []
 
     def go_on(self, seconds: int) -> None:
         for _ in range(seconds):
             self.clock.now_s += 1.0
-            while self.queue and (place := self.places.take(1)) is not None:
+            while self.queue and (slot := self.slots.acquire(1)) is not None:
                 job = self.queue.pop(0)
-                one = Running((job,), place, self.host, 0, (), started_s=self.clock.now_s)
+                one = Running((job,), slot, self.host, 0, (), started_s=self.clock.now_s)
                 self.running.append(one)
             self.host.used_mib = 1000.0 + self.memory_mib * len(self.running)
             rate = self.rates[min(len(self.running), len(self.rates)) - 1] / len(self.running)
@@ -343,7 +343,7 @@ class Packed:
                 one.jobs[0].progress.reports += 1 if rate else 0
             for one in self.crowd.look(self.running):
                 self.running.remove(one)
-                self.places.give_back(one.place)
+                self.slots.release(one.slot)
                 self.queue.insert(0, one.jobs[0])
 
 
@@ -375,7 +375,7 @@ def test_jobs_of_another_command_are_measured_anew(clock: Clock) -> None:
     packed.queue = [replace(job, command=("other",)) for job in packed.queue]
     packed.rates = [1000.0 * k for k in range(1, 17)]
     done = packed.running.pop()
-    packed.places.give_back(done.place)
+    packed.slots.release(done.slot)
     packed.go_on(400)
     assert packed.crowd.decisions[-1]["at_once"] > 4
 
@@ -403,7 +403,7 @@ def test_short_jobs_are_added_without_a_measurement(clock: Clock) -> None:
         packed.go_on(15)
         done = packed.running.pop(0)
         done.jobs[0].progress.state = "completed"
-        packed.places.give_back(done.place)
+        packed.slots.release(done.slot)
     packed.go_on(2)
     # The second that completed had begun beside three others; the first had been alone.
     assert [change["at_once"] for change in packed.crowd.decisions][:2] == [4, 8]
@@ -411,11 +411,11 @@ def test_short_jobs_are_added_without_a_measurement(clock: Clock) -> None:
 
 
 def test_a_job_alone_on_its_gpu_may_have_all_of_it(kind: CommandKind) -> None:
-    work, place = place_of()
+    work, slot = place_of()
     job = CommandJob(0, {}, ("true",))
-    assert kind.start((job,), place).process.memory_fraction == 0.5
+    assert kind.start((job,), slot).process.memory_fraction == 0.5
     with closing(LocalHost(GPU)) as host:
-        alone = Places(work.sites([host])).take(1, alone=True)
+        alone = SlotPool(work.sites([host])).acquire(1, alone=True)
     assert alone is not None
     process = kind.start((job,), alone).process
     assert process.memory_fraction is None

@@ -52,17 +52,17 @@ def test_plan_over_uneven_instances(monkeypatch: pytest.MonkeyPatch):
     here = machine_of(monkeypatch, fake_nvml.H200_MIXED)
     plan = planned(here, gmis_per_gpu=4, backend="mig")
     sizes = {one.uuid: one.profile for one in here.gpus[0].instances}
-    assert [sizes[share.device] for share in plan.slices] == [
+    assert [sizes[allocation.device] for allocation in plan.allocations] == [
         *("3g.71gb", "2g.35gb", "1g.18gb", "1g.18gb")
     ]
-    assert {share.memory_fraction for share in plan.slices} == {0.8}
+    assert {allocation.memory_fraction for allocation in plan.allocations} == {0.8}
     assert (plan.strategy, plan.intra) == ("mpr", "host")
 
 
 def test_gmis_that_share_instances_split_memory_and_need_mps(monkeypatch: pytest.MonkeyPatch):
     here = machine_of(monkeypatch, fake_nvml.A100_HALVES)
     plan = planned(here, gmis_per_gpu=3, backend="mig")
-    assert [share.memory_fraction for share in plan.slices] == [0.8, 0.4, 0.4]
+    assert [allocation.memory_fraction for allocation in plan.allocations] == [0.8, 0.4, 0.4]
     with pytest.raises(BackendUnavailable, match=r"3 MIG instances for 4 GMIs, and MPS"):
         planned(here, gmis_per_gpu=4, backend="mig")
     here = machine_of(monkeypatch, fake_nvml.A100_SEVEN, mps_control=MPS)

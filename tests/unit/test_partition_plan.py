@@ -14,7 +14,7 @@ from gmijax.errors import BackendUnavailable, ConfigError
 from gmijax.machine.snapshot import Machine
 from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
-from gmijax.partition.plan import Plan, Slice
+from gmijax.partition.plan import Allocation, Plan
 from gmijax.partition.shares import split_cores
 
 ON_MPS = machine(1, mps_control=MPS)
@@ -41,10 +41,18 @@ def test_plan_survives_json(num_gpus: int):
     assert Plan.from_dict(json.loads(json.dumps(plan.to_dict()))) == plan
 
 
-def test_plan_refuses_slices_that_do_not_fit_the_layout():
-    slices = (Slice(1, 0, "cpu", None, None, ()),)
+def test_a_plan_of_an_older_version_is_read():
+    plan = planned(machine(2, mps_control=MPS), gpus=2, gmis_per_gpu=2)
+    data = plan.to_dict()
+    former = {"slices": data.pop("allocations"), "may_share": data.pop("allow_fallback"), **data}
+    former["slices"] = [{**one, "priority": 0} for one in former["slices"]]
+    assert Plan.from_dict(json.loads(json.dumps(former))) == plan
+
+
+def test_plan_refuses_allocations_that_do_not_fit_the_layout():
+    allocations = (Allocation(1, 0, "cpu", None, None, ()),)
     with pytest.raises(ConfigError, match="do not match layout"):
-        Plan(Layout(((0,),)), slices, "cpu", "tcg_ex", 8, "none", "host", ("trainer",))
+        Plan(Layout(((0,),)), allocations, "cpu", "tcg_ex", 8, "none", "host", ("trainer",))
 
 
 def test_every_auto_has_a_reason_and_explicit_choices_have_none():
@@ -147,24 +155,31 @@ def test_backend_that_cannot_be_had_is_refused(here: Machine, backend: str, mess
 def test_gpus_in_mig_mode_are_passed_over():
     here = machine(0, gpus=(gpu(0, mig_enabled=True), gpu(1), gpu(2)))
     plan = planned(here, gpus=1)
-    assert plan.slices[0].device == gpu(1).uuid
+    assert plan.allocations[0].device == gpu(1).uuid
     assert "GPUs [1]: not [0], which are in MIG mode" in plan.reasons
-    assert [share.device for share in planned(here, gpus=2).slices] == [gpu(1).uuid, gpu(2).uuid]
+    assert [allocation.device for allocation in planned(here, gpus=2).allocations] == [
+        gpu(1).uuid,
+        gpu(2).uuid,
+    ]
     with pytest.raises(BackendUnavailable, match="GPU 0 is in MIG mode"):
         planned(here, gpus=3)
 
 
 def test_memory_is_split_over_the_gmis_of_a_gpu_and_gpus_can_be_chosen_by_index():
     plan = planned(machine(3), gpus=(2, 0), layout=((0, 1), (2,)))
-    assert [share.memory_fraction for share in plan.slices] == [0.4, 0.4, 0.8]
-    assert [share.device for share in plan.slices] == [gpu(2).uuid, gpu(2).uuid, gpu(0).uuid]
+    assert [allocation.memory_fraction for allocation in plan.allocations] == [0.4, 0.4, 0.8]
+    assert [allocation.device for allocation in plan.allocations] == [
+        gpu(2).uuid,
+        gpu(2).uuid,
+        gpu(0).uuid,
+    ]
 
 
 def test_any_number_of_gpus_is_virtual_on_cpu():
     plan = planned(machine(1, cpu_cores=(0, 1)), gpus=4, gmis_per_gpu=2, backend="cpu")
     assert plan.layout.num_gmis == 8
-    assert [share.cpus for share in plan.slices] == [(0,), (1,)] * 4
-    assert {share.device for share in plan.slices} == {"cpu"}
+    assert [allocation.cpus for allocation in plan.allocations] == [(0,), (1,)] * 4
+    assert {allocation.device for allocation in plan.allocations} == {"cpu"}
 
 
 @given(st.sets(st.integers(0, 200), min_size=1), st.integers(1, 40))

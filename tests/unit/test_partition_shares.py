@@ -24,14 +24,14 @@ def planned(gmis_per_gpu: int = 2, **changes: Any) -> Plan:
 
 
 def caps(plan: Plan) -> list[float | None]:
-    return [share.sm_percent for share in plan.slices]
+    return [allocation.sm_percent for allocation in plan.allocations]
 
 
 def test_every_gmi_can_have_its_own_share_and_none_is_the_default():
     assert caps(planned()) == [None, None]
     plan = planned(sm_percent=(50.0, 25.0), memory_fraction=(0.5, 0.2))
     assert caps(plan) == [50.0, 25.0]
-    assert [share.memory_fraction for share in plan.slices] == [0.5, 0.2]
+    assert [allocation.memory_fraction for allocation in plan.allocations] == [0.5, 0.2]
 
 
 @pytest.mark.parametrize("key", ["sm_percent", "memory_fraction"])

@@ -30,8 +30,8 @@ def test_the_plan_of_nodes_has_each_nodes_shares_under_global_ids() -> None:
     settings = PlanConfig(gmis_per_gpu=2), ReduceConfig(), 16
     plan = make_plan(*settings, machine(0), nodes=here)
     assert plan.layout.gmis_of_gpu == ((0, 1), (2, 3))
-    assert [share.gpu for share in plan.slices] == [0, 0, 1, 1]
-    assert plan.slices[2].cpus == plan.slices[0].cpus
+    assert [allocation.gpu for allocation in plan.allocations] == [0, 0, 1, 1]
+    assert plan.allocations[2].cpus == plan.allocations[0].cpus
     assert plan.strategy == "mpr"
     assert plan.nodes_data()[1] == {"address": "10.0.0.2", "gmis": [2, 3]}
     assert Plan.from_dict(plan.to_dict()) == plan
@@ -44,10 +44,10 @@ def test_the_plan_of_nodes_has_each_nodes_shares_under_global_ids() -> None:
 def test_gmis_of_nodes_share_the_gpus_of_their_node() -> None:
     plan = plan_on(gpus_of_nodes(2, 3), gpus=2, gmis_per_gpu=2)
     assert plan.backend == "mps"
-    devices = [share.device for share in plan.slices]
+    devices = [allocation.device for allocation in plan.allocations]
     assert devices == [f"GPU-{node}-{gpu}" for node in (0, 1) for gpu in (0, 1) for _ in range(2)]
-    assert [share.gpu for share in plan.slices] == [0, 0, 1, 1, 2, 2, 3, 3]
-    assert {share.memory_fraction for share in plan.slices} == {0.4}
+    assert [allocation.gpu for allocation in plan.allocations] == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert {allocation.memory_fraction for allocation in plan.allocations} == {0.4}
     variables = gmi_environment(plan, 5, {}, Path("/cache"), {})
     assert variables["CUDA_VISIBLE_DEVICES"] == "GPU-1-0"
     assert variables["XLA_CLIENT_MEM_FRACTION"] == "0.4"
@@ -70,7 +70,7 @@ def test_nodes_with_gpus_do_inside_what_one_machine_does(
 def test_a_gpu_of_two_nodes_of_one_machine_has_half_of_its_memory_for_each() -> None:
     nodes = {"a": machine(1), "a#1": machine(1)}
     plan = plan_on(nodes, backend="share", gmis_per_gpu=2)
-    assert [share.memory_fraction for share in plan.slices] == [0.2] * 4
+    assert [allocation.memory_fraction for allocation in plan.allocations] == [0.2] * 4
     assert "nodes of one machine have the same GPUs, and divide their memory" in plan.reasons
     with pytest.raises(ConfigError, match=r"4 GMIs on GPU 0 would reserve 1.20 of its memory"):
         plan_on(nodes, backend="share", gmis_per_gpu=2, memory_fraction=0.3)
@@ -127,8 +127,10 @@ def test_agents_and_trainers_are_placed_over_the_gpus_of_all_nodes(
     assert plan.to_dict()["layout"] == (layout or of_nodes)
     assert [node["gmis"] for node in plan.nodes_data()] == of_nodes
     assert plan.strategy == strategy
-    assert [share.gmi for share in plan.slices] == list(plan.layout.gmis)
-    assert [plan.layout.gpu_of(share.gmi) for share in plan.slices] == [s.gpu for s in plan.slices]
+    assert [allocation.gmi for allocation in plan.allocations] == list(plan.layout.gmis)
+    assert [plan.layout.gpu_of(allocation.gmi) for allocation in plan.allocations] == [
+        s.gpu for s in plan.allocations
+    ]
     assert Plan.from_dict(plan.to_dict()) == plan
 
 

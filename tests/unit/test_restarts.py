@@ -265,7 +265,9 @@ def test_a_lost_gpu_shrinks_the_plan(
     plan = training_plan(config, FOUR)
     assert with_gpus_left(config, plan, FOUR) == (config, plan, ())
     config, shrunk, notes = with_gpus_left(config, plan, LEFT)
-    assert [share.device for share in shrunk.slices] == [gpu(index).uuid for index in devices]
+    assert [allocation.device for allocation in shrunk.allocations] == [
+        gpu(index).uuid for index in devices
+    ]
     assert (plan.strategy, shrunk.strategy) == strategies
     assert (str(shrunk.layout), shrunk.num_envs_per_gmi) == (layout, 64)
     assert notes[0].startswith("GPUs [1] of the job are gone: continuing with ")

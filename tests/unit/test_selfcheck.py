@@ -65,8 +65,8 @@ def test_wrong_products_are_found(
 
 def test_a_wrong_share_is_named(monkeypatch: pytest.MonkeyPatch):
     plan = planned(machine(0), self_check="on")
-    capped = dataclasses.replace(plan.slices[0], device="GPU-0", sm_percent=33.0)
-    plan = dataclasses.replace(plan, slices=(capped,))
+    capped = dataclasses.replace(plan.allocations[0], device="GPU-0", sm_percent=33.0)
+    plan = dataclasses.replace(plan, allocations=(capped,))
     monkeypatch.setattr(selfcheck, "SIZES", SMALL)
     monkeypatch.setattr(selfcheck, "multiply", one_tile_missing)
     with pytest.raises(

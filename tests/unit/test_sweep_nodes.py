@@ -1,4 +1,4 @@
-"""A sweep over nodes without Ray: places, nodes that are lost, who is first, what Ray is asked."""
+"""A sweep over nodes without Ray: slots, nodes that are lost, who is first, what Ray is asked."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from gmijax.sweeps.host import LocalHost, Order, Start
 from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.nodes import RemoteHost, SweepNode, nodes_of, num_cpus_of
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Place, Places, Site, places_of
 from gmijax.sweeps.report import Report
 from gmijax.sweeps.scheduler import Scheduler
+from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
 from gmijax.sweeps.study import Study
 from gmijax.sweeps.sweep import sweep_of
 from gmijax.sweeps.training import TrainingKind
@@ -88,14 +88,14 @@ class FakeHost(LocalHost):
 
 
 class Sweep:
-    """Jobs on two nodes, with two places each unless told otherwise."""
+    """Jobs on two nodes, with two slots each unless told otherwise."""
 
     def __init__(self, folder: Path, jobs: Iterable[Job], **settings: Any) -> None:
         self.jobs, self.paths = list(jobs), SweepPaths(folder)
         self.settings = SweepConfig(**{"jobs_per_gpu": 2} | settings)
         self.nodes = FakeHost("a"), FakeHost("b")
-        plan = places_of(self.settings, machine(0), {"auto"})
-        self.places = Places([Site(plan, node.machine, node.name) for node in self.nodes])
+        plan = plan_slots(self.settings, machine(0), {"auto"})
+        self.slots = SlotPool([Site(plan, node.machine, node.name) for node in self.nodes])
 
     def run(self, *steps: Any, kind: type[TrainingKind] = TrainingKind) -> None:
         """Runs it; the steps are called one after another, the last one in every tick."""
@@ -105,7 +105,7 @@ class Sweep:
             (left.pop(0) if len(left) > 1 else left[0])()
 
         ranking = self.settings
-        args = kind(ranking, self.paths), ranking, self.paths, self.places, self.nodes, tick
+        args = kind(ranking, self.paths), ranking, self.paths, self.slots, self.nodes, tick
         Scheduler(self.jobs, Study(), *args).run(StopSignals())
 
     def states(self) -> list[str]:
@@ -126,42 +126,42 @@ def jobs(count: int, *overrides: str) -> list[Job]:
     return list(jobs_of([compose(f"num_envs={16 * (n + 1)}", *overrides) for n in range(count)]))
 
 
-def gpu_nodes(*num_gpus: int) -> Places:
+def gpu_nodes(*num_gpus: int) -> SlotPool:
     sites = []
     for node, count in enumerate(num_gpus):
         here = machine(count, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
         sites.append(
-            Site(places_of(SweepConfig(jobs_per_gpu=2), here, {"auto"}), here, f"n{node}")
+            Site(plan_slots(SweepConfig(jobs_per_gpu=2), here, {"auto"}), here, f"n{node}")
         )
-    return Places(sites)
+    return SlotPool(sites)
 
 
 def test_jobs_go_to_the_node_with_most_room_and_never_on_two() -> None:
-    places = gpu_nodes(2, 2)
-    both = places.take(2)
+    slots = gpu_nodes(2, 2)
+    both = slots.acquire(2)
     assert both is not None
-    assert (both.site, both.label) == (0, "n0 GPU 0 place 0, n0 GPU 1 place 0")
+    assert (both.site, both.label) == (0, "n0 GPU 0 slot 0, n0 GPU 1 slot 0")
     assert both.devices == (gpu(0).uuid, gpu(1).uuid)
-    singles = [place for _ in range(4) if (place := places.take(1))]
-    assert [place.site for place in singles] == [1, 1, 0, 0]
-    assert places.take(1, avoid={1}) is None
-    assert places.take(1) is not None
-    assert places.take(2) is None
-    other = places.take(1, avoid={0})
+    singles = [slot for _ in range(4) if (slot := slots.acquire(1))]
+    assert [slot.site for slot in singles] == [1, 1, 0, 0]
+    assert slots.acquire(1, avoid={1}) is None
+    assert slots.acquire(1) is not None
+    assert slots.acquire(2) is None
+    other = slots.acquire(1, avoid={0})
     assert other is not None
     assert (other.site, other.backend, other.is_whole_gpu) == (1, "mps", False)
 
 
-def test_places_of_a_node_that_is_gone_are_not_taken_or_given_back() -> None:
-    places = gpu_nodes(1, 1)
-    place = places.take(1)
-    assert place is not None
-    places.drop(place.site)
-    places.give_back(place)
-    assert [taken.site for _ in range(3) if (taken := places.take(1))] == [1, 1]
-    assert not places.has_room()
-    places.drop(1)
-    assert not places.left
+def test_slots_of_a_node_that_is_gone_are_neither_acquired_nor_released() -> None:
+    slots = gpu_nodes(1, 1)
+    slot = slots.acquire(1)
+    assert slot is not None
+    slots.remove_site(slot.site)
+    slots.release(slot)
+    assert [taken.site for _ in range(3) if (taken := slots.acquire(1))] == [1, 1]
+    assert not slots.has_free_slot()
+    slots.remove_site(1)
+    assert not slots.left
 
 
 def test_jobs_of_a_node_that_is_lost_run_again_on_the_other(tmp_path: Path) -> None:
@@ -250,8 +250,8 @@ def test_a_profile_of_a_job_with_two_gpus_has_both(
 class AwaitedKind(TrainingKind):
     """Jobs that compile what others of their program find in a cache."""
 
-    def start(self, jobs: tuple[Job, ...], place: Place) -> kind.Start:
-        return super().start(jobs, place)._replace(is_awaited=True)
+    def start(self, jobs: tuple[Job, ...], slot: Slot) -> kind.Start:
+        return super().start(jobs, slot)._replace(is_awaited=True)
 
 
 def test_jobs_that_wait_for_a_lock_by_themselves_start_at_once(tmp_path: Path) -> None:
@@ -308,7 +308,7 @@ def test_a_job_whose_folder_is_none_of_a_run_is_left_to_itself(tmp_path: Path) -
     jobs = jobs_of([compose(f"seed={seed}") for seed in range(3)])
     sweep = Sweep(tmp_path, jobs, pack="vmap")
     write_json(sweep.paths.job(1).root / "notes.json", {})
-    sweep.places.drop(1)
+    sweep.slots.remove_site(1)
     sweep.run(sweep.end_all)
     assert sweep.nodes[0].together == [["000", "002"], ["001"]]
 
@@ -320,7 +320,7 @@ class EndsOfAProgram:
         steps = "num_timesteps=1000"
         jobs = jobs_of([compose(f"seed={seed}", steps, *overrides) for seed in range(3)])
         self.sweep = Sweep(folder, jobs, pack="vmap", jobs_per_gpu=3)
-        self.sweep.places.drop(1)
+        self.sweep.slots.remove_site(1)
         self.runs = [self.sweep.paths.job(number) for number in range(3)]
 
     def lose(self) -> None:
@@ -373,7 +373,7 @@ def test_what_a_node_refuses_is_raised_here_and_does_not_lose_it() -> None:
 
     node = RemoteNode(lambda method, *args: Answer(getattr(here, method)(*args)), 1, "10.0.0.2")
     host = RemoteHost(Joined(node, Facts("10.0.0.2", Machine((), (0,)), {})), "10.0.0.2")
-    plan = places_of(SweepConfig(jobs_per_gpu=1), machine(0), {"auto"})
+    plan = plan_slots(SweepConfig(jobs_per_gpu=1), machine(0), {"auto"})
     with pytest.raises(BackendUnavailable, match="no daemon"):
         host.open(plan, RunPaths(Path("nowhere")))
     assert host.lost is None

@@ -41,9 +41,9 @@ def running_jobs() -> list[Job]:
             progress.updated_s = now_s - 1790.0
         if steps:
             progress.state, progress.started_s = "running", now_s - 1800.0
-            progress.place = f"GPU 3 place {job.number}"
+            progress.slot = f"GPU 3 slot {job.number}"
     done = jobs[2].progress
-    done.state, done.ended_s, done.place, done.env_steps_per_s = "completed", now_s, "", 0.0
+    done.state, done.ended_s, done.slot, done.env_steps_per_s = "completed", now_s, "", 0.0
     jobs[3].progress.error = "again, alone on its GPU, after CUDA_ERROR_[/x]"
     return jobs
 
@@ -76,9 +76,9 @@ def test_the_table_says_of_each_job_where_and_how_far_it_is() -> None:
         shown = terminal.getvalue()
     lines = [printable(line).split() for line in shown.splitlines()]
     rows = {words[0]: " ".join(words) for words in reversed(lines) if words}
-    assert "overrides GPU and place progress steps/s return ranked by ETA state" in rows["job"]
+    assert "overrides GPU and slot progress steps/s return ranked by ETA state" in rows["job"]
     assert rows["0"].endswith("50% 50 2.5 3.5 0:10 running")
-    assert "seed=0 GPU 3 place 0" in rows["0"]
+    assert "seed=0 GPU 3 slot 0" in rows["0"]
     assert rows["1"].endswith("25% 50 2.5 3.5 0:15 running")
     assert rows["2"].endswith("100% 2.5 3.5 completed")
     assert "waiting: again, alone on its GPU, after CUDA_ERROR_[/x]" in rows["3"]
@@ -92,7 +92,7 @@ def test_without_a_terminal_every_change_is_a_line() -> None:
         view.update()
         jobs[0].progress.state, jobs[0].progress.error = "failed", "GMI 0 failed: NonFiniteError"
     lines = said.getvalue().splitlines()
-    assert lines[:2] == [f"job {n} seed={n}: running on GPU 3 place {n}" for n in range(2)]
+    assert lines[:2] == [f"job {n} seed={n}: running on GPU 3 slot {n}" for n in range(2)]
     assert lines[2].startswith("job 2 seed=2: completed after 1800 s, return 3.5; 2 running")
     assert lines[3:] == ["job 0 seed=0: failed: GMI 0 failed: NonFiniteError"]
 
@@ -179,7 +179,7 @@ def events(path: Path) -> list[Any]:
 
 
 def test_the_table_hides_nothing_of_an_override() -> None:
-    """Without GPUs it has no column of places, and names the keys without their groups."""
+    """Without GPUs it has no column of slots, and names the keys without their groups."""
     overrides = ("algo.learning_rate=0.00012345", "env.settings.goal_height_m=0.75")
     jobs = list(jobs_of([compose("num_timesteps=1000", *overrides), compose()]))
     jobs[0].progress.state = "running"
@@ -190,7 +190,7 @@ def test_the_table_hides_nothing_of_an_override() -> None:
         Console(file=said, width=width).print(view._table())
         text[width] = said.getvalue()
     assert "…" not in text[80]
-    assert "place" not in text[80]
+    assert "slot" not in text[80]
     assert "starting" in text[80]
     for part in ("learning_rate=0.00012345", "goal_height_m=0.75"):
         assert part in text[120]

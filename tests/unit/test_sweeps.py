@@ -1,4 +1,4 @@
-"""Sweeps without processes: lists to jobs, places, curves, rankings, what is refused."""
+"""Sweeps without processes: lists to jobs, slots, curves, rankings, what is refused."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.objective import why_not_comparable, with_objective
 from gmijax.sweeps.packs import most_together, require_packable
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.places import Place, Places, Site, places_of
 from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import Report, spread, tables
+from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
 
 
 @pytest.mark.parametrize(
@@ -177,42 +177,42 @@ def test_returns_of_different_rewards_are_warned_of(
         assert said.startswith(f"warning: sweep.objective={objective}: jobs differ in env.rewards")
 
 
-def gpu_places(gpus: int, jobs_per_gpu: int) -> Places:
+def gpu_slots(gpus: int, jobs_per_gpu: int) -> SlotPool:
     here = machine(gpus, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
-    plan = places_of(SweepConfig(jobs_per_gpu=jobs_per_gpu), here, {"auto"})
-    return Places([Site(plan, here)])
+    plan = plan_slots(SweepConfig(jobs_per_gpu=jobs_per_gpu), here, {"auto"})
+    return SlotPool([Site(plan, here)])
 
 
-def taken(places: Places, num_gpus: int = 1, *, alone: bool = False) -> Place:
-    place = places.take(num_gpus, alone=alone)
-    assert place is not None
-    return place
+def taken(slots: SlotPool, num_gpus: int = 1, *, alone: bool = False) -> Slot:
+    slot = slots.acquire(num_gpus, alone=alone)
+    assert slot is not None
+    return slot
 
 
 def test_jobs_go_to_the_gpu_with_most_room_and_large_ones_to_several() -> None:
-    places = gpu_places(2, 2)
-    first, second = taken(places), taken(places)
+    slots = gpu_slots(2, 2)
+    first, second = taken(slots), taken(slots)
     assert first.backend == "mps"
-    assert {first.label, second.label} == {"GPU 0 place 0", "GPU 1 place 0"}
-    assert len(set(taken(places, 2).devices)) == 2
-    assert places.take(1) is None
-    places.give_back(first)
-    assert places.take(2) is None
-    assert places.take(1) == first
+    assert {first.label, second.label} == {"GPU 0 slot 0", "GPU 1 slot 0"}
+    assert len(set(taken(slots, 2).devices)) == 2
+    assert slots.acquire(1) is None
+    slots.release(first)
+    assert slots.acquire(2) is None
+    assert slots.acquire(1) == first
 
 
-def test_a_job_alone_has_all_places_of_its_gpu() -> None:
-    places = gpu_places(2, 2)
-    _, second = taken(places), taken(places)
-    assert places.take(1, alone=True) is None
-    places.give_back(second)
-    alone = taken(places, alone=True)
-    assert alone.label == "GPU 1 place 0 alone"
+def test_a_job_alone_has_all_slots_of_its_gpu() -> None:
+    slots = gpu_slots(2, 2)
+    _, second = taken(slots), taken(slots)
+    assert slots.acquire(1, alone=True) is None
+    slots.release(second)
+    alone = taken(slots, alone=True)
+    assert alone.label == "GPU 1 slot 0 alone"
     assert alone.devices == second.devices
-    taken(places)
-    assert places.take(1) is None
-    places.give_back(alone)
-    assert taken(places) == second
+    taken(slots)
+    assert slots.acquire(1) is None
+    slots.release(alone)
+    assert taken(slots) == second
 
 
 @pytest.mark.parametrize(
@@ -243,36 +243,36 @@ def test_jobs_divide_the_memory_of_a_gpu(
     overrides: tuple[str, ...], fraction: float, tmp_path: Path
 ) -> None:
     (job,) = jobs_of([compose(*overrides)])
-    config = placed(job, SweepPaths(tmp_path).job(7), taken(gpu_places(1, 4)), "mps")
+    config = placed(job, SweepPaths(tmp_path).job(7), taken(gpu_slots(1, 4)), "mps")
     assert config.plan.memory_fraction == fraction
     assert config.plan.backend == "mps"
     assert (config.run.dir, config.run.resume) == (str(tmp_path / "007"), "auto")
     assert config.wandb.group == tmp_path.name
 
 
-def test_jobs_of_one_program_have_the_memory_and_cores_of_their_places() -> None:
-    places = gpu_places(2, 4)
+def test_jobs_of_one_program_have_the_memory_and_cores_of_their_slots() -> None:
+    slots = gpu_slots(2, 4)
     (job,) = jobs_of([compose()])
-    three = places.take(1, num_jobs=3)
+    three = slots.acquire(1, num_jobs=3)
     assert three is not None
     assert (three.size, three.devices) == (3, (gpu(0).uuid,))
     assert three.memory_fraction(job.config) == 0.6
-    assert len(three.cpus) == 3 * len(taken(places).cpus)
-    rest = [places.take(1, num_jobs=8) for _ in range(2)]
-    assert [place.size for place in rest if place is not None] == [3, 1]
-    assert not places.has_room()
-    places.give_back(three)
-    again = places.take(1, num_jobs=8)
+    assert len(three.cpus) == 3 * len(taken(slots).cpus)
+    rest = [slots.acquire(1, num_jobs=8) for _ in range(2)]
+    assert [slot.size for slot in rest if slot is not None] == [3, 1]
+    assert not slots.has_free_slot()
+    slots.release(three)
+    again = slots.acquire(1, num_jobs=8)
     assert again is not None
     assert (again.size, again.is_alone) == (3, False)
-    places = gpu_places(1, 4)
-    alone = places.take(1, alone=True, num_jobs=3)
+    slots = gpu_slots(1, 4)
+    alone = slots.acquire(1, alone=True, num_jobs=3)
     assert alone is not None
     assert (alone.size, len(alone.kept_free), alone.is_alone) == (3, 1, True)
-    places.give_back(alone)
-    whole = places.take(1, num_jobs=4)
+    slots.release(alone)
+    whole = slots.acquire(1, num_jobs=4)
     assert whole is not None
-    assert (whole.is_alone, whole.label) == (True, "GPU 0 place 0")
+    assert (whole.is_alone, whole.label) == (True, "GPU 0 slot 0")
 
 
 @pytest.mark.parametrize(
@@ -312,7 +312,7 @@ def test_playground_in_warp_is_not_packed() -> None:
 
 def test_too_many_jobs_for_the_machine_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"sweep\.jobs_per_gpu=2000"):
-        gpu_places(1, 2000)
+        gpu_slots(1, 2000)
 
 
 def lines_of(

@@ -38,7 +38,7 @@ class MpsBackend(Backend):
     """Runs the daemons of a job while it is entered.
 
     Args:
-      plan: its slices name the devices.
+      plan: its allocations name the devices.
       machine: where the control program is, and whether somebody's daemon runs.
       run: logs go below its `mps` folder.
       gmis: those that are clients of a daemon; None for all.
@@ -52,7 +52,7 @@ class MpsBackend(Backend):
     ) -> None:
         super().__init__(plan, machine, run)
         gmis = plan.layout.gmis if gmis is None else gmis
-        self._devices = {gmi: plan.slices[gmi].device for gmi in gmis}
+        self._devices = {gmi: plan.allocations[gmi].device for gmi in gmis}
         if machine.mps_control is None and self._devices:
             raise BackendUnavailable(
                 f"plan.backend={plan.backend}: nvidia-cuda-mps-control was not found"
@@ -234,17 +234,18 @@ class MigBackend(MpsBackend):
         self, plan: Plan, machine: Machine, run: RunPaths, gmis: Collection[int] | None = None
     ) -> None:
         existing = {one.uuid for gpu in machine.gpus for one in gpu.instances}
-        here = [plan.slices[gmi] for gmi in (plan.layout.gmis if gmis is None else gmis)]
-        for share in here:
-            if share.device not in existing:
+        here = [plan.allocations[gmi] for gmi in (plan.layout.gmis if gmis is None else gmis)]
+        for allocation in here:
+            if allocation.device not in existing:
                 raise BackendUnavailable(
-                    f"plan.backend=mig: instance {share.device} of GMI {share.gmi} does not exist"
+                    f"plan.backend=mig: instance {allocation.device} of GMI {allocation.gmi} "
+                    "does not exist"
                 )
-        sharing = Counter(share.device for share in plan.slices)
+        sharing = Counter(allocation.device for allocation in plan.allocations)
         clients = [
-            share.gmi
-            for share in here
-            if sharing[share.device] > 1 or share.device in machine.daemons
+            allocation.gmi
+            for allocation in here
+            if sharing[allocation.device] > 1 or allocation.device in machine.daemons
         ]
         # A daemon of somebody else is for other devices than the job's instances.
         own_only = dataclasses.replace(machine, operator_daemon=None)

@@ -1,4 +1,4 @@
-"""Places for jobs: the slices of a plan of GMIs that have nothing to do with each other."""
+"""Slots for jobs: the allocations of a plan of GMIs that have nothing to do with each other."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from gmijax.config import BackendName, PlanConfig, ReduceConfig, TrainConfig
 from gmijax.config.sweep import JobsConfig
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
-from gmijax.partition.plan import Plan, Slice
+from gmijax.partition.plan import Allocation, Plan
 from gmijax.partition.planner import make_plan
 
 
 @dataclass(frozen=True)
-class Place:
+class Slot:
     """Where a job runs.
 
     Attributes:
-      slices: one of each of its GPUs.
-      label: in words, e.g. `GPU 0 place 1` by the index of nvidia-smi, on a node after its
+      allocations: one of each of its GPUs.
+      label: in words, e.g. `GPU 0 slot 1` by the index of nvidia-smi, on a node after its
         address; without GPUs the address alone, or nothing.
       kept_free: others of its GPUs, where nobody else runs meanwhile.
       joined: others of its GPU, whose memory and cores it has too.
       site: index of its machine.
-      backend: of that machine's places.
-      is_whole_gpu: whether GPUs have one place each.
+      backend: of that machine's slots.
+      is_whole_gpu: whether GPUs have one slot each.
       is_alone: whether nobody else runs on its GPUs meanwhile.
     """
 
-    slices: tuple[Slice, ...]
+    allocations: tuple[Allocation, ...]
     label: str
-    kept_free: tuple[Slice, ...]
+    kept_free: tuple[Allocation, ...]
     site: int
     backend: BackendName
     is_whole_gpu: bool
     is_alone: bool
-    joined: tuple[Slice, ...] = ()
+    joined: tuple[Allocation, ...] = ()
 
     @property
     def size(self) -> int:
@@ -47,31 +47,35 @@ class Place:
     @property
     def devices(self) -> tuple[str, ...]:
         """UUIDs of its GPUs or MIG instances; none on a machine without GPUs."""
-        return tuple(share.device for share in self.slices if share.device != "cpu")
+        return tuple(
+            allocation.device for allocation in self.allocations if allocation.device != "cpu"
+        )
 
     @property
     def cpus(self) -> tuple[int, ...]:
         """Cores of its processes."""
-        return tuple(sorted({cpu for one in (*self.slices, *self.joined) for cpu in one.cpus}))
+        return tuple(
+            sorted({cpu for one in (*self.allocations, *self.joined) for cpu in one.cpus})
+        )
 
     def memory_fraction(self, config: TrainConfig) -> float | None:
         """For each GMI of a job that is put here; None where memory is not divided."""
-        fraction = self.slices[0].memory_fraction
+        fraction = self.allocations[0].memory_fraction
         if fraction is None:
             return None
-        return max(0.01, int(1e4 * self.size * fraction / gmis_of_place(config)) / 1e4)
+        return max(0.01, int(1e4 * self.size * fraction / gmis_per_slot(config)) / 1e4)
 
 
-def gmis_of_place(config: TrainConfig) -> int:
-    """How many GMIs a job has at each of its places."""
+def gmis_per_slot(config: TrainConfig) -> int:
+    """How many GMIs a job has at each of its slots."""
     plan = config.plan
     if config.is_decoupled:
         return plan.serving_gmis_per_gpu + plan.training_gmis_per_gpu
     return 1 if plan.gmis_per_gpu == "auto" else plan.gmis_per_gpu
 
 
-def places_of(settings: JobsConfig, machine: Machine, backends: Collection[str]) -> Plan:
-    """A plan whose slices are the places: of GMIs that have nothing to do with each other.
+def plan_slots(settings: JobsConfig, machine: Machine, backends: Collection[str]) -> Plan:
+    """A plan whose allocations are the slots: of GMIs that have nothing to do with each other.
 
     Args:
       settings: of the sweep.
@@ -93,10 +97,10 @@ def places_of(settings: JobsConfig, machine: Machine, backends: Collection[str])
 
 
 class Site(NamedTuple):
-    """A machine with places.
+    """A machine with slots.
 
     Attributes:
-      plan: see `places_of`.
+      plan: see `plan_slots`.
       machine: what it was made for.
       name: address of a node; None: this machine.
     """
@@ -106,8 +110,8 @@ class Site(NamedTuple):
     name: str | None = None
 
 
-class Places:
-    """All places of a sweep, free and taken; a job's are all on one machine.
+class SlotPool:
+    """All slots of a sweep, free and taken; a job's are all on one machine.
 
     Args:
       sites: where they are.
@@ -115,27 +119,27 @@ class Places:
 
     def __init__(self, sites: Sequence[Site]) -> None:
         self._sites = list(sites)
-        self._free = [list(site.plan.slices) for site in sites]
-        self._all = [_by_gpu(site.plan.slices) for site in sites]
+        self._free = [list(site.plan.allocations) for site in sites]
+        self._all = [_by_gpu(site.plan.allocations) for site in sites]
         self._labels = [_labels(site) for site in sites]
         self._limits: dict[tuple[int, int], int] = {}
         self.left = set(range(len(sites)))
 
-    def has_room(self, avoid: Collection[int] = ()) -> bool:
-        """Whether any place is free on machines other than those of `avoid`."""
-        return self.num_gpus_with_room(avoid) > 0
+    def has_free_slot(self, avoid: Collection[int] = ()) -> bool:
+        """Whether any slot is free on machines other than those of `avoid`."""
+        return self.num_gpus_with_free_slot(avoid) > 0
 
-    def num_gpus_with_room(self, avoid: Collection[int] = ()) -> int:
-        """GPUs that have a free place, on machines other than those of `avoid`."""
-        return sum(len(self._open(site)) for site in self.left.difference(avoid))
+    def num_gpus_with_free_slot(self, avoid: Collection[int] = ()) -> int:
+        """GPUs that have a free slot, on machines other than those of `avoid`."""
+        return sum(len(self._open_slots(site)) for site in self.left.difference(avoid))
 
     def limit(self, site: int, gpu: int, count: int) -> None:
-        """From now on so many places of a GPU may be taken; those that are taken stay so."""
+        """From now on so many slots of a GPU may be taken; those that are taken stay so."""
         self._limits[site, gpu] = count
 
-    def _open(self, site: int) -> dict[int, list[Slice]]:
-        """Free places by GPU, no more than its limit allows to be taken."""
-        found: dict[int, list[Slice]] = {}
+    def _open_slots(self, site: int) -> dict[int, list[Allocation]]:
+        """Free slots by GPU, no more than its limit allows to be taken."""
+        found: dict[int, list[Allocation]] = {}
         for gpu, free in _by_gpu(self._free[site]).items():
             all_of_it = len(self._all[site][gpu])
             limit = self._limits.get((site, gpu), all_of_it)
@@ -143,23 +147,23 @@ class Places:
                 found[gpu] = free[:room]
         return found
 
-    def take(
+    def acquire(
         self,
         num_gpus: int,
         *,
         alone: bool = False,
         avoid: Collection[int] = (),
         num_jobs: int = 1,
-    ) -> Place | None:
-        """A place on each of `num_gpus` GPUs of a machine, those with the most free ones.
+    ) -> Slot | None:
+        """A slot on each of `num_gpus` GPUs of a machine, those with the most free ones.
 
         With `alone` they are GPUs on which nobody else runs, now or until it is given back. The
         machines of `avoid` are left out. None: not now. On one GPU it has room for up to
         `num_jobs` jobs.
         """
-        found: list[tuple[int, list[list[Slice]]]] = []
+        found: list[tuple[int, list[list[Allocation]]]] = []
         for site in sorted(self.left.difference(avoid)):
-            by_gpu = self._open(site)
+            by_gpu = self._open_slots(site)
             if alone:
                 here, free = self._all[site], _by_gpu(self._free[site])
                 by_gpu = {gpu: free[gpu] for gpu in by_gpu if free[gpu] == here[gpu]}
@@ -171,49 +175,55 @@ class Places:
         site, emptiest = max(found, key=lambda one: sum(map(len, one[1])))
         taken = tuple(free[0] for free in emptiest)
         # Of a GPU with MIG a job has one instance.
-        rest = [share for share in emptiest[0][1:] if share.device == taken[0].device]
+        rest = [
+            allocation for allocation in emptiest[0][1:] if allocation.device == taken[0].device
+        ]
         joined = tuple(rest[: num_jobs - 1]) if num_gpus == 1 else ()
-        others = [share for free in emptiest for share in free[1:] if share not in joined]
+        others = [
+            allocation for free in emptiest for allocation in free[1:] if allocation not in joined
+        ]
         return self._taken(site, taken, joined, tuple(others) if alone else ())
 
     def _taken(
         self,
         site: int,
-        taken: tuple[Slice, ...],
-        joined: tuple[Slice, ...],
-        kept_free: tuple[Slice, ...],
-    ) -> Place:
+        taken: tuple[Allocation, ...],
+        joined: tuple[Allocation, ...],
+        kept_free: tuple[Allocation, ...],
+    ) -> Slot:
         gone, here = (*taken, *joined, *kept_free), self._all[site]
-        self._free[site] = [share for share in self._free[site] if share not in gone]
-        is_alone = sum(len(here[share.gpu]) for share in taken) == len(gone)
-        label = ", ".join(self._labels[site][share.gmi] for share in taken)
-        return Place(
+        self._free[site] = [
+            allocation for allocation in self._free[site] if allocation not in gone
+        ]
+        is_alone = sum(len(here[allocation.gpu]) for allocation in taken) == len(gone)
+        label = ", ".join(self._labels[site][allocation.gmi] for allocation in taken)
+        return Slot(
             taken,
             f"{label} alone" if kept_free else label,
             kept_free,
             site,
             self._sites[site].plan.backend,
-            is_whole_gpu=all(len(slices) == 1 for slices in here.values()),
+            is_whole_gpu=all(len(allocations) == 1 for allocations in here.values()),
             is_alone=is_alone,
             joined=joined,
         )
 
-    def give_back(self, place: Place) -> None:
+    def release(self, slot: Slot) -> None:
         """The job that was there has ended."""
-        if place.site in self.left:
-            free = [*self._free[place.site], *place.slices, *place.kept_free, *place.joined]
-            self._free[place.site] = sorted(free, key=lambda share: share.gmi)
+        if slot.site in self.left:
+            free = [*self._free[slot.site], *slot.allocations, *slot.kept_free, *slot.joined]
+            self._free[slot.site] = sorted(free, key=lambda allocation: allocation.gmi)
 
-    def drop(self, site: int) -> None:
+    def remove_site(self, site: int) -> None:
         """The machine is gone."""
         self.left.discard(site)
         self._free[site] = []
 
 
-def _by_gpu(slices: Iterable[Slice]) -> dict[int, list[Slice]]:
-    found: dict[int, list[Slice]] = {}
-    for share in slices:
-        found.setdefault(share.gpu, []).append(share)
+def _by_gpu(allocations: Iterable[Allocation]) -> dict[int, list[Allocation]]:
+    found: dict[int, list[Allocation]] = {}
+    for allocation in allocations:
+        found.setdefault(allocation.gpu, []).append(allocation)
     return found
 
 
@@ -223,9 +233,9 @@ def _labels(site: Site) -> dict[int, str]:
     index_of |= {one.uuid: gpu.index for gpu in site.machine.gpus for one in gpu.instances}
     node = f"{site.name} " if site.name else ""
     labels: dict[int, str] = {}
-    for here in _by_gpu(site.plan.slices).values():
-        for place, share in enumerate(here):
-            is_gpu = share.device in index_of
-            gpu = f"GPU {index_of[share.device]} place {place}" if is_gpu else ""
-            labels[share.gmi] = f"{node}{gpu}".rstrip()
+    for here in _by_gpu(site.plan.allocations).values():
+        for slot, allocation in enumerate(here):
+            is_gpu = allocation.device in index_of
+            gpu = f"GPU {index_of[allocation.device]} slot {slot}" if is_gpu else ""
+            labels[allocation.gmi] = f"{node}{gpu}".rstrip()
     return labels
