@@ -18,7 +18,7 @@ from gmijax import demo, doctor, list_envs
 from gmijax.cli.answers import COMMANDS
 from gmijax.cli.compose import defaults
 from gmijax.cli.groups import choices
-from gmijax.cli.help import Key, keys_of, usage_of
+from gmijax.cli.help import HelpKey, keys_of, usage_of
 
 DOCS: Final = Path(__file__).parent
 
@@ -178,7 +178,7 @@ def command_page(name: str) -> str:
     return "\n".join([*lines, *_topics_of(name, keys), ""])
 
 
-def _choices_of(name: str, keys: Sequence[Key]) -> Iterator[str]:
+def _choices_of(name: str, keys: Sequence[HelpKey]) -> Iterator[str]:
     for group in dict.fromkeys(key.name.partition(".")[0] for key in keys):
         names = choices(group)
         if len(names) > 1:
@@ -191,8 +191,8 @@ def _choices_of(name: str, keys: Sequence[Key]) -> Iterator[str]:
             yield from ("", f"{task} {ask}")
 
 
-def _topics_of(command: str, keys: Sequence[Key]) -> Iterator[str]:
-    groups: dict[str, list[Key]] = {}
+def _topics_of(command: str, keys: Sequence[HelpKey]) -> Iterator[str]:
+    groups: dict[str, list[HelpKey]] = {}
     for key in keys:
         group = key.choice or (key.name.partition(".")[0] if "." in key.name else "")
         groups.setdefault(group, []).append(key)
@@ -212,7 +212,7 @@ def _topics_of(command: str, keys: Sequence[Key]) -> Iterator[str]:
                 yield from _table(members)
 
 
-def _parts(keys: Sequence[Key]) -> dict[str, list[Key]]:
+def _parts(keys: Sequence[HelpKey]) -> dict[str, list[HelpKey]]:
     """Keys of an algorithm, as `LEARNING` orders them."""
     by_name = {key.name.removeprefix("algo."): key for key in keys}
     parts = {
@@ -233,7 +233,7 @@ def title_of(guide: str) -> str:
     return first.removeprefix("# ").partition(":")[0]
 
 
-def _table(keys: Sequence[Key]) -> Iterator[str]:
+def _table(keys: Sequence[HelpKey]) -> Iterator[str]:
     yield from ("", "| key | values | default | meaning |", "|---|---|---|---|")
     for key in keys:
         anchor = "-".join(filter(None, (key.name, key.choice.replace("=", "-"))))
@@ -257,7 +257,7 @@ def _values(kind: Any) -> str:
     return "`null`" if kind is type(None) else kind.__name__
 
 
-def _limits(key: Key) -> str:
+def _limits(key: HelpKey) -> str:
     low, high, positive = key.limits
     if positive:
         return ", greater than 0"

@@ -35,7 +35,7 @@ _MOST_DIGITS: Final = 9
 """Of a GPU's index; Python reads no number with thousands of them."""
 
 
-class Options(NamedTuple):
+class DoctorOptions(NamedTuple):
     """Options of the command line."""
 
     as_json: bool = False
@@ -55,7 +55,7 @@ def main(argv: Sequence[str]) -> int:
     return EXIT_FAILED if problems else code
 
 
-def _answer(options: Options) -> Sequence[str]:
+def _answer(options: DoctorOptions) -> Sequence[str]:
     """Prints what was asked for; returns what is broken."""
     if options.mig is not None:
         sys.stdout.write(split_text(options.mig, options.gpu, detect_machine()))
@@ -73,9 +73,9 @@ def _answer(options: Options) -> Sequence[str]:
     return found.problems
 
 
-def parse(argv: Sequence[str]) -> Options:
+def parse(argv: Sequence[str]) -> DoctorOptions:
     """Raises ConfigError for what it does not know."""
-    options = Options()
+    options = DoctorOptions()
     for text in argv:
         key, _, value = text.partition("=")
         if text == "--json":

@@ -156,7 +156,7 @@ def gradients(
     )
 
 
-class Updated(NamedTuple):
+class UpdateResult(NamedTuple):
     """Results of an update, beside the state.
 
     Attributes:
@@ -187,7 +187,7 @@ def update(
     _: Any,
     state: TrainState,
     weighted: tuple[Unrolls, Array],
-) -> tuple[TrainState, tuple[()], Updated]:
+) -> tuple[TrainState, tuple[()], UpdateResult]:
     """See `make_update`."""
     batch, weight = weighted
     targets = batch_targets(learner, state, batch, weight)
@@ -205,4 +205,4 @@ def update(
     weights = pack_weights(acting_weights(learner, state))
     means = jax.tree.map(jnp.mean, losses)
     explained = explained_variance(target, error)
-    return state, (), Updated(weights, means, rate_figures(learner.config, rates), explained)
+    return state, (), UpdateResult(weights, means, rate_figures(learner.config, rates), explained)

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.a3c.job_registers import JobRegisters, Orders, Report
+from gmijax.a3c.job_registers import AgentCommand, AgentReport, JobRegisters
 from gmijax.a3c.rollout import UnrollPrograms, num_counts
 from gmijax.a3c.targets import Unrolls
 from gmijax.channels.sender import Sender
@@ -44,7 +44,7 @@ _SLICE_S = 0.5
 """Longest wait for room before the agent looks for orders again."""
 
 
-class _Sent(NamedTuple):
+class _PendingRollout(NamedTuple):
     """An unroll that is being computed: what it will be, and the first policy that makes it."""
 
     experience: Unrolls
@@ -68,9 +68,9 @@ class Agent:
         assert isinstance(self.config.algo, A3cConfig)
         self._algo = self.config.algo
         self._learner = make_learner(self.env.spec, self._algo)
-        self._report = Report.of_nothing(num_counts(self.env))
+        self._report = AgentReport.of_nothing(num_counts(self.env))
         self._orders_seen = 0
-        self._orders = Orders(None, is_ending=False)
+        self._orders = AgentCommand(None, is_ending=False)
         self._weights_seen = 0
         self._version = 0
         self._unrolls = 0
@@ -127,7 +127,7 @@ class Agent:
     def _loop(
         self, programs: UnrollPrograms, weights: ActingWeights, env_state: BatchState
     ) -> None:
-        pending: _Sent | None = None
+        pending: _PendingRollout | None = None
         unpack = jax.jit(lambda packed: unpack_weights(weights, packed))
         while not self._obey(env_state):
             weights = self._newest(weights, unpack)
@@ -143,7 +143,7 @@ class Agent:
                 # While the device computes this unroll, the one before is sent.
                 if index == 0 and pending is not None:
                     self._send(pending, env_state)
-            pending = _Sent(*programs.join(pieces), version)
+            pending = _PendingRollout(*programs.join(pieces), version)
         self._publish()
 
     def _newest(
@@ -155,7 +155,7 @@ class Agent:
         self._weights_seen, self._version = snapshot.count, snapshot.tag
         return unpack(snapshot.values.view(np.float32))
 
-    def _send(self, unroll: _Sent, env_state: BatchState) -> None:
+    def _send(self, unroll: _PendingRollout, env_state: BatchState) -> None:
         arrays: dict[str, Any] = unroll.experience._asdict()
         if not self.sender.on_device:
             arrays = {name: np.asarray(values) for name, values in arrays.items()}
@@ -242,7 +242,7 @@ class Agent:
     def _look(self) -> bool:
         """Takes up new orders; returns whether there ever were any."""
         if (snapshot := self.registers.orders.read(self._orders_seen)) is not None:
-            self._orders_seen, self._orders = snapshot.count, Orders.unpack(snapshot.values)
+            self._orders_seen, self._orders = snapshot.count, AgentCommand.unpack(snapshot.values)
         return self._orders_seen > 0
 
     def _publish(self) -> None:

@@ -17,7 +17,7 @@ from gmijax.channels.registers import AnyRegister, open_registers
 _NO_CHECKPOINT = -1
 
 
-class Orders(NamedTuple):
+class AgentCommand(NamedTuple):
     """What the leading trainer wants of all agents.
 
     To add their environments to the `checkpoint` of so many environment steps, if there is one,
@@ -32,13 +32,13 @@ class Orders(NamedTuple):
         return np.array([_number(self.checkpoint), self.is_ending], np.int64)
 
     @classmethod
-    def unpack(cls, values: npt.NDArray[np.uint8]) -> Orders:
+    def unpack(cls, values: npt.NDArray[np.uint8]) -> AgentCommand:
         """Inverts `pack`."""
         checkpoint, is_ending = values.view(np.int64)
         return cls(_optional(checkpoint), bool(is_ending))
 
 
-class Report(NamedTuple):
+class AgentReport(NamedTuple):
     """What an agent has done since its start.
 
     Attributes:
@@ -60,7 +60,7 @@ class Report(NamedTuple):
     stats: npt.NDArray[np.float64]
 
     @classmethod
-    def of_nothing(cls, num_stats: int) -> Report:
+    def of_nothing(cls, num_stats: int) -> AgentReport:
         """That of an agent which has done nothing."""
         return cls(None, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(num_stats))
 
@@ -70,7 +70,7 @@ class Report(NamedTuple):
         return np.concatenate([np.array(head, np.float64), self.stats])
 
     @classmethod
-    def unpack(cls, values: npt.NDArray[np.uint8]) -> Report:
+    def unpack(cls, values: npt.NDArray[np.uint8]) -> AgentReport:
         """Inverts `pack`."""
         numbers, head = values.view(np.float64), len(cls._fields) - 1
         first, *rest = (float(x) for x in numbers[:head])
@@ -87,8 +87,8 @@ class JobRegisters(NamedTuple):
 
 def register_bytes(num_weights: int, num_stats: int) -> tuple[int, int, int]:
     """Sizes of orders, weights and a report."""
-    report_bytes = 8 * (len(Report._fields) - 1 + num_stats)
-    return 8 * len(Orders._fields), 4 * num_weights, report_bytes
+    report_bytes = 8 * (len(AgentReport._fields) - 1 + num_stats)
+    return 8 * len(AgentCommand._fields), 4 * num_weights, report_bytes
 
 
 def open_job_registers(fd: int, num_weights: int, num_stats: int, num_agents: int) -> JobRegisters:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.a3c.a3c import Updated
-from gmijax.a3c.job_registers import JobRegisters, Orders, Report
+from gmijax.a3c.a3c import UpdateResult
+from gmijax.a3c.job_registers import AgentCommand, AgentReport, JobRegisters
 from gmijax.a3c.report import BatchCounts, Reporter
 from gmijax.clock import running_s
 from gmijax.config import TrainConfig
@@ -50,7 +50,7 @@ class Leader:
 
     def __post_init__(self) -> None:
         self._seen = [0] * len(self.agents)
-        self._reports: list[Report | None] = [None] * len(self.agents)
+        self._reports: list[AgentReport | None] = [None] * len(self.agents)
         self._pending: int | None = None  # Environment steps of a checkpoint.
         self._checkpoint: Path | None = None
         limit_steps = self.env.spec.episode_length * self.config.envs_per_gmi * len(self.agents)
@@ -76,7 +76,7 @@ class Leader:
         env_steps: int,
         updates: int,
         counts: BatchCounts,
-        updated: Updated,
+        updated: UpdateResult,
         update_s: float,
         state: TrainState,
     ) -> None:
@@ -155,13 +155,13 @@ class Leader:
         )
 
     def _order(self, checkpoint: int | None, *, is_ending: bool) -> None:
-        self.registers.orders.publish(Orders(checkpoint, is_ending).pack())
+        self.registers.orders.publish(AgentCommand(checkpoint, is_ending).pack())
 
     def _hear(self) -> None:
         for index, register in enumerate(self.registers.reports):
             if (snapshot := register.read(self._seen[index])) is not None:
                 self._seen[index] = snapshot.count
-                self._reports[index] = Report.unpack(snapshot.values)
+                self._reports[index] = AgentReport.unpack(snapshot.values)
 
     def _missing(self) -> list[int]:
         """Agents that have not added to the pending checkpoint."""

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 from jax.flatten_util import ravel_pytree
 
-from gmijax.a3c.a3c import A3cLosses, Updated
-from gmijax.a3c.job_registers import Report
-from gmijax.learning.training_log import Learnt, TrainingLog
+from gmijax.a3c.a3c import A3cLosses, UpdateResult
+from gmijax.a3c.job_registers import AgentReport
+from gmijax.learning.training_log import TrainingLog, UpdateMetrics
 from gmijax.learning.unroll import no_counts
 from gmijax.sim.wrappers import BatchedEnv
 
@@ -60,9 +60,9 @@ class Reporter:
         self.bytes_per_s: list[float] = []
         zeros, unpack = ravel_pytree(no_counts(env.spec, env.overflows))
         self._unpack: Any = unpack
-        self._before = Report.of_nothing(zeros.size)
+        self._before = AgentReport.of_nothing(zeros.size)
         self._env_steps = env_steps
-        self._updates: list[tuple[Updated, float, float]] = []
+        self._updates: list[tuple[UpdateResult, float, float]] = []
         self._stale = 0.0
         self._recent = np.zeros(MAX_COUNTED + 1, np.float32)
         self._whole = np.zeros(MAX_COUNTED + 1, np.float64)
@@ -72,7 +72,7 @@ class Reporter:
         """Whether the last line is old enough."""
         return time.monotonic() - self.log.last_s >= LINE_EVERY_S
 
-    def add(self, counts: BatchCounts, updated: Updated, update_s: float) -> None:
+    def add(self, counts: BatchCounts, updated: UpdateResult, update_s: float) -> None:
         """Takes in one update, of so many seconds."""
         self._updates.append((updated, update_s, counts.receive_s))
         self._stale += counts.stale
@@ -84,7 +84,7 @@ class Reporter:
         return None if figures is None else {"mean": figures[0], "p99": figures[1]}
 
     def write(
-        self, env_steps: int, reports: Sequence[Report], figures: Mapping[str, float]
+        self, env_steps: int, reports: Sequence[AgentReport], figures: Mapping[str, float]
     ) -> None:
         """Writes the line of the updates since the last one; nothing if there were none.
 
@@ -113,7 +113,7 @@ class Reporter:
         self.log.write(
             env_steps,
             jax.tree.map(float, self._unpack(stats)),
-            Learnt(losses, figures, rates),
+            UpdateMetrics(losses, figures, rates),
             others,
             simulated=predictions,
             now_s=now_s,
@@ -146,7 +146,9 @@ class Reporter:
             },
         )
 
-    def _of_experience(self, sums: Report, reports: Sequence[Report]) -> dict[str, float | None]:
+    def _of_experience(
+        self, sums: AgentReport, reports: Sequence[AgentReport]
+    ) -> dict[str, float | None]:
         mean, p99 = mean_and_p99(self._recent) or (None, None)
         return {
             "async/staleness_mean": mean,
@@ -177,8 +179,8 @@ def mean_and_p99(histogram: npt.NDArray[np.floating]) -> tuple[float, float] | N
     return float(histogram @ behind) / total, float(behind[min(p99, len(behind) - 1)])
 
 
-def _total(reports: Sequence[Report]) -> Report:
+def _total(reports: Sequence[AgentReport]) -> AgentReport:
     """Sums over agents, since they started."""
     numbers = zip(*(report[1:-1] for report in reports), strict=True)
     stats = np.sum([report.stats for report in reports], axis=0)
-    return Report._make([None, *map(sum, numbers), stats])
+    return AgentReport._make([None, *map(sum, numbers), stats])

@@ -24,7 +24,7 @@ MOST_IDLE: Final = 0.95
 Line = Mapping[str, Any]
 
 
-class Enough:
+class ProfileWindow:
     """Whether a profile can be read: enough was done since its channels had filled.
 
     Agents compile for different times, and until the channels are full they never wait: nothing

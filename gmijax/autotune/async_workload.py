@@ -15,7 +15,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from gmijax.autotune.async_profile import Enough, measured_of, window_start
+from gmijax.autotune.async_profile import ProfileWindow, measured_of, window_start
 from gmijax.autotune.grid import Measured, Point
 from gmijax.autotune.workloads import Split, Workload, peak_memory_mib, results_of
 from gmijax.config import AUTO, PlanConfig, TrainConfig
@@ -102,7 +102,7 @@ class A3cWorkload(Workload[TrainConfig]):
 
     def enough(self, plan: Plan, run: RunPaths) -> Callable[[Sequence[GmiStatus]], bool]:
         """See `Workload`."""
-        return Enough(self.config, plan, run)
+        return ProfileWindow(self.config, plan, run)
 
     def read(self, plan: Plan, run: RunPaths) -> Measured:
         """See `Workload`; raises ValueError for too few lines of metrics."""

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
-from gmijax.autotune.search import Outcome, Visited
+from gmijax.autotune.search import SearchOutcome, SearchPoint
 from gmijax.autotune.workloads import Split
 from gmijax.supervise.watched_gmi import GmiStatus
 
@@ -59,7 +59,7 @@ class SearchDisplay:
         self._console.print(f"{point}: {_found(point, result)} ({wall_s:.0f} s)")
 
 
-def verdict(outcome: Outcome, grid: Grid, num_gpus: int, split: Split | None = None) -> str:
+def verdict(outcome: SearchOutcome, grid: Grid, num_gpus: int, split: Split | None = None) -> str:
     """The answer and what it is worth, in words; only for an outcome with a best point."""
     assert outcome.best is not None
     top = outcome.best
@@ -86,7 +86,7 @@ def verdict(outcome: Outcome, grid: Grid, num_gpus: int, split: Split | None = N
     return said
 
 
-def table(outcome: Outcome) -> Table:
+def table(outcome: SearchOutcome) -> Table:
     """One row per point, best marked."""
     shown = Table(title="environment steps per second")
     for heading in ("GMIs", "envs", "MJX", "one GMI", "whole job", "MiB", "saturation"):
@@ -114,7 +114,7 @@ def table(outcome: Outcome) -> Table:
     return shown
 
 
-def plain_data(outcome: Outcome, reason: str, split: Split | None = None) -> dict[str, Any]:
+def plain_data(outcome: SearchOutcome, reason: str, split: Split | None = None) -> dict[str, Any]:
     """The outcome for `search.json`."""
     best = outcome.best
     gpus = {} if split is None else {f"{what}_gpus": n for what, n in split._asdict().items()}
@@ -134,7 +134,7 @@ def plain_data(outcome: Outcome, reason: str, split: Split | None = None) -> dic
     }
 
 
-def draw(outcome: Outcome, picture: Path, title: str) -> None:
+def draw(outcome: SearchOutcome, picture: Path, title: str) -> None:
     """Draws throughput of a GPU and memory of a GMI over environments, a line per GMIs per GPU."""
     # Imported here: it costs half a second that no other use of this module should pay.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -188,12 +188,12 @@ def _found(point: Point, result: Measured | NotRunnable) -> str:
     )
 
 
-def _highest(outcome: Outcome, wanted: Any) -> Visited | None:
+def _highest(outcome: SearchOutcome, wanted: Any) -> SearchPoint | None:
     fitting = [one for one in outcome.visited if one.projected and wanted(one.point.gmis_per_gpu)]
     return max(fitting, key=lambda one: one.projected) if fitting else None
 
 
-def _answer(top: Visited, split: Split | None) -> str:
+def _answer(top: SearchPoint, split: Split | None) -> str:
     """Who is where, in words."""
     point = top.point
     envs = f"{point.num_envs} environments each"
@@ -209,7 +209,7 @@ def _answer(top: Visited, split: Split | None) -> str:
     )
 
 
-def _reason_of(split: Split, top: Visited) -> str:
+def _reason_of(split: Split, top: SearchPoint) -> str:
     assert isinstance(top.result, Measured)
     acting, learning = top.result.acting_per_s, top.result.learning_per_s
     slower = "agents" if split.serving * acting < split.training * learning else "trainers"

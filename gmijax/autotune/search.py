@@ -65,7 +65,7 @@ class Rules(NamedTuple):
     top: Callable[[Measured], float]  # What Sat goes by.
 
 
-class Visited(NamedTuple):
+class SearchPoint(NamedTuple):
     """A point that was looked at."""
 
     point: Point
@@ -74,11 +74,11 @@ class Visited(NamedTuple):
     projected: float  # Environment steps a second of the whole job; 0 where it cannot run.
 
 
-class Outcome(NamedTuple):
+class SearchOutcome(NamedTuple):
     """Result of a search."""
 
-    visited: tuple[Visited, ...]  # All points that were looked at, in order.
-    best: Visited | None  # The best of them, None where nothing ran.
+    visited: tuple[SearchPoint, ...]  # All points that were looked at, in order.
+    best: SearchPoint | None  # The best of them, None where nothing ran.
     complete: bool  # Whether the search ended by its rules, and not for want of time.
 
 
@@ -108,19 +108,19 @@ def estimate(gmis_per_gpu: int, num_gpus: int, measured: Measured) -> float:
     return together * measured.iteration_s / longer_s
 
 
-def search(grid: Grid, profile: Profile, rules: Rules) -> Outcome:
+def search(grid: Grid, profile: Profile, rules: Rules) -> SearchOutcome:
     """Looks for the point with the highest projected throughput."""
-    book = _Book(profile, rules)
+    book = _Measurements(profile, rules)
     complete = True
     try:
         _first_look(book, grid)
         _climb(book, grid)
     except OutOfBudget:
         complete = False
-    return Outcome(tuple(book.visited.values()), best(book.visited), complete)
+    return SearchOutcome(tuple(book.visited.values()), best(book.visited), complete)
 
 
-def best(visited: Mapping[Point, Visited]) -> Visited | None:
+def best(visited: Mapping[Point, SearchPoint]) -> SearchPoint | None:
     """Lines 21 to 24: the simplest of the points that are within `TOLERANCE` of the highest."""
     runnable = [one for one in visited.values() if isinstance(one.result, Measured)]
     if not runnable:
@@ -128,22 +128,22 @@ def best(visited: Mapping[Point, Visited]) -> Visited | None:
     highest = max(one.projected for one in runnable)
     good = [one for one in runnable if one.projected >= highest * (1.0 - TOLERANCE)]
 
-    def simplest_first(one: Visited) -> tuple[float, ...]:
+    def simplest_first(one: SearchPoint) -> tuple[float, ...]:
         point = one.point
         return (point.gmis_per_gpu + point.trainers, point.num_envs, -one.projected)
 
     return min(good, key=simplest_first)
 
 
-class _Book:
+class _Measurements:
     """Points measured so far; measures no point twice."""
 
     def __init__(self, profile: Profile, rules: Rules) -> None:
-        self.visited: dict[Point, Visited] = {}
+        self.visited: dict[Point, SearchPoint] = {}
         self.rules = rules
         self._profile = profile
 
-    def visit(self, point: Point) -> Visited:
+    def visit(self, point: Point) -> SearchPoint:
         """Measures a point, if it was not, and compares it with its row."""
         if point not in self.visited:
             result = self._profile(point)
@@ -152,10 +152,10 @@ class _Book:
                 projected = self.rules.estimate(point, result)
                 before = self._before(point)
                 sat = None if before is None else saturation(before, result, self.rules.top)
-            self.visited[point] = Visited(point, result, sat, projected)
+            self.visited[point] = SearchPoint(point, result, sat, projected)
         return self.visited[point]
 
-    def is_saturated(self, one: Visited) -> bool:
+    def is_saturated(self, one: SearchPoint) -> bool:
         """Line 18."""
         return one.saturation is not None and one.saturation < ALPHA
 
@@ -163,7 +163,7 @@ class _Book:
         """Whether the point's row ended, by saturation, at a smaller size."""
         return any(self.is_saturated(one) for one in self._smaller(point))
 
-    def best(self) -> Visited | None:
+    def best(self) -> SearchPoint | None:
         """Lines 21 to 24, so far."""
         return best(self.visited)
 
@@ -176,14 +176,14 @@ class _Book:
         ]
         return max(ran, key=lambda item: item[0])[1] if ran else None
 
-    def _smaller(self, point: Point) -> Iterator[Visited]:
+    def _smaller(self, point: Point) -> Iterator[SearchPoint]:
         for other, one in self.visited.items():
             is_same_row = other._replace(num_envs=point.num_envs) == point
             if is_same_row and other.num_envs < point.num_envs:
                 yield one
 
 
-def _rows(book: _Book, grid: Grid) -> None:
+def _rows(book: _Measurements, grid: Grid) -> None:
     """Lines 2 to 26 over a grid, in its order."""
     for impl, gmis_per_gpu in product(grid.impls, grid.gmis_per_gpu):
         for num_envs in grid.num_envs:
@@ -191,7 +191,7 @@ def _rows(book: _Book, grid: Grid) -> None:
                 break
 
 
-def _first_look(book: _Book, grid: Grid) -> None:
+def _first_look(book: _Measurements, grid: Grid) -> None:
     """The coarse rows; smaller sizes only as long as nothing runs.
 
     An implementation that is clearly slower in the first row did not catch up where both were
@@ -205,7 +205,7 @@ def _first_look(book: _Book, grid: Grid) -> None:
         sizes = tuple(size for size in sizes if size < part.num_envs[0])
 
 
-def _worth_more(book: _Book, impls: Sequence[str]) -> tuple[str, ...]:
+def _worth_more(book: _Measurements, impls: Sequence[str]) -> tuple[str, ...]:
     """The implementations that are not clearly slower than another, as far as is known."""
     highest = dict.fromkeys(impls, 0.0)
     for point, one in book.visited.items():
@@ -214,7 +214,7 @@ def _worth_more(book: _Book, impls: Sequence[str]) -> tuple[str, ...]:
     return tuple(impl for impl in impls if highest[impl] >= least)
 
 
-def _climb(book: _Book, grid: Grid) -> None:
+def _climb(book: _Measurements, grid: Grid) -> None:
     """Measures the neighbours of the best point until all of them are known."""
     while (top := book.best()) is not None:
         fresh = [

@@ -18,7 +18,7 @@ from gmijax.autotune.async_workload import A3cWorkload
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
 from gmijax.autotune.profile import ProfileLate, profile
 from gmijax.autotune.report import SearchDisplay, draw, plain_data, table, verdict
-from gmijax.autotune.search import Outcome, OutOfBudget, Rules, Visited
+from gmijax.autotune.search import OutOfBudget, Rules, SearchOutcome, SearchPoint
 from gmijax.autotune.store import ProfileStore
 from gmijax.autotune.workloads import (
     C,
@@ -166,7 +166,7 @@ class Search:
         gmis_per_gpu, num_envs, impl, trainers = best.point
         return SearchResult(run_dir, gmis_per_gpu, num_envs, impl, reason, report, trainers, split)
 
-    def _outcome(self) -> Outcome:
+    def _outcome(self) -> SearchOutcome:
         rules = Rules(estimate=self._workload.projected, top=self._workload.top)
         chosen = import_module(_ORDERS[self._settings.order])
         return chosen.search(self._grid, self._profile, rules)
@@ -217,7 +217,7 @@ class Search:
             error.add_note(f"the same search goes on from {self._store.path}")
             raise
 
-    def _require_best(self, outcome: Outcome) -> Visited:
+    def _require_best(self, outcome: SearchOutcome) -> SearchPoint:
         if outcome.best is not None:
             return outcome.best
         if not outcome.visited:

@@ -9,25 +9,25 @@ from __future__ import annotations
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
 from gmijax.autotune.search import (
     ALPHA,
-    Outcome,
     OutOfBudget,
     Profile,
     Rules,
-    Visited,
+    SearchOutcome,
+    SearchPoint,
     saturation,
 )
 from gmijax.errors import ConfigError
 
 
-def search(grid: Grid, profile: Profile, rules: Rules) -> Outcome:
+def search(grid: Grid, profile: Profile, rules: Rules) -> SearchOutcome:
     """Goes through the whole grid, from the most GMIs down and from the smallest size up.
 
     Raises:
       ConfigError: no row has a second point that runs and gains: the first only starts the
         comparison (lines 9 to 12).
     """
-    visited: list[Visited] = []
-    candidates: list[Visited] = []
+    visited: list[SearchPoint] = []
+    candidates: list[SearchPoint] = []
     is_complete = True
     try:
         for impl in grid.impls:
@@ -45,29 +45,29 @@ def search(grid: Grid, profile: Profile, rules: Rules) -> Outcome:
             "runs only starts the comparison; give more sizes in search.num_envs"
         )
     best = max(candidates, key=lambda one: one.projected, default=None)  # Lines 21 to 24.
-    return Outcome(tuple(visited), best, is_complete)
+    return SearchOutcome(tuple(visited), best, is_complete)
 
 
 def _search_row(
     row: list[Point],
     profile: Profile,
     rules: Rules,
-    visited: list[Visited],
-    candidates: list[Visited],
+    visited: list[SearchPoint],
+    candidates: list[SearchPoint],
 ) -> None:
     """Lines 4 to 26."""
     before: Measured | None = None
     for point in row:
         result = profile(point)  # Line 5.
         if isinstance(result, NotRunnable):  # Lines 6 to 8.
-            visited.append(Visited(point, result, None, 0.0))
+            visited.append(SearchPoint(point, result, None, 0.0))
             continue
         projected = rules.estimate(point, result)  # Line 20.
         if before is None:  # Lines 9 to 12.
-            visited.append(Visited(point, result, None, projected))
+            visited.append(SearchPoint(point, result, None, projected))
         else:
             sat = saturation(before, result, rules.top)  # Lines 13 to 16.
-            visited.append(Visited(point, result, sat, projected))
+            visited.append(SearchPoint(point, result, sat, projected))
             if sat < ALPHA:  # Lines 18 and 19.
                 return
             candidates.append(visited[-1])

@@ -21,8 +21,8 @@ import numpy as np
 from gmijax.baselines.tdg_steps import infer, next_keys, simulate
 from gmijax.channels.pipe import Message, PipeReader, PipeWriter
 from gmijax.channels.pipe_block import PipeBlock
-from gmijax.collection.collectors import Share
-from gmijax.collection.programs import Step
+from gmijax.collection.collectors import CollectorContext
+from gmijax.collection.programs import CollectedStep
 from gmijax.compile_once import compile_once
 from gmijax.errors import PipeClosed
 from gmijax.learning.unroll import Counts, no_counts
@@ -31,22 +31,22 @@ from gmijax.partition.templates import AGENT, SIMULATOR, has_role
 from gmijax.supervise.child import ENV_PIPES_FD, required_fd
 
 
-def collect(share: Share, plan: Plan) -> dict[str, Any]:
+def collect(context: CollectorContext, plan: Plan) -> dict[str, Any]:
     """Does what the plan gives to this GMI; the outcome for `result.json`.
 
     Raises:
       NonFiniteError, CollectiveError: as `gmijax.collection.collectors.collect`.
     """
-    gmi = share.link.gmi
+    gmi = context.link.gmi
     simulates = has_role(plan.roles[gmi], SIMULATOR)
     wanted = AGENT if simulates else SIMULATOR
     with closing(PipeBlock(required_fd(ENV_PIPES_FD), gmi)) as block:
         peers = [
-            _Peer(block, other, share.config.run.exchange_timeout_s)
+            _Peer(block, other, context.config.run.exchange_timeout_s)
             for other in sorted(plan.layout.neighbours_of(gmi))
             if has_role(plan.roles[other], wanted)
         ]
-        return _run_simulator(share, peers[0]) if simulates else _run_agent(share, peers)
+        return _run_simulator(context, peers[0]) if simulates else _run_agent(context, peers)
 
 
 class _Peer:
@@ -70,16 +70,16 @@ class _Peer:
         self._writer.close()
 
 
-def _run_simulator(share: Share, agent: _Peer) -> dict[str, Any]:
+def _run_simulator(context: CollectorContext, agent: _Peer) -> dict[str, Any]:
     """Makes the unrolls of this GMI with the actions of `agent`; see `collect`."""
-    share.link.begin_compiling()
+    context.link.begin_compiling()
     started_s = time.monotonic()
-    state = share.reset()
-    simulator = _Simulator(share, agent, state)
-    compile_s = time.monotonic() - started_s - share.link.start_s["waiting"]
-    share.link.beat("ready", 0)
-    share.barrier()
-    outcome = share.record(simulator.unrolls())
+    state = context.reset()
+    simulator = _Simulator(context, agent, state)
+    compile_s = time.monotonic() - started_s - context.link.start_s["waiting"]
+    context.link.beat("ready", 0)
+    context.barrier()
+    outcome = context.record(simulator.unrolls())
     agent.close()
     stages = {"simulate": simulator.simulate_s, "exchange": simulator.exchange_s}
     return {
@@ -97,37 +97,37 @@ class _Simulator:
     actions on the host: both pipes, the agent, and waiting while it serves others.
     """
 
-    def __init__(self, share: Share, agent: _Peer, state: Any) -> None:
-        config, spec = share.config, share.env.spec
-        self._share = share
+    def __init__(self, context: CollectorContext, agent: _Peer, state: Any) -> None:
+        config, spec = context.config, context.env.spec
+        self._context = context
         self._agent = agent
         self._state, self._bits = jax.jit(next_keys)(state)
         self._actions = (
             np.zeros((config.envs_per_gmi, spec.action_size), np.float32),
             np.zeros(config.envs_per_gmi, np.float32),
         )
-        self._no_counts = no_counts(spec, share.env.overflows)
-        program = jax.jit(partial(simulate, share.env, share.keep), donate_argnums=(1,))
+        self._no_counts = no_counts(spec, context.env.overflows)
+        program = jax.jit(partial(simulate, context.env, context.keep), donate_argnums=(1,))
         self._program = compile_once(
-            program.lower(share.env.model, self._state, self._no_counts, *self._actions)
+            program.lower(context.env.model, self._state, self._no_counts, *self._actions)
         )
         self.simulate_s: deque[float] = deque(maxlen=config.latency_steps)
         self.exchange_s: deque[float] = deque(maxlen=config.latency_steps)
 
-    def unrolls(self) -> Iterator[tuple[Step | None, Counts]]:
+    def unrolls(self) -> Iterator[tuple[CollectedStep | None, Counts]]:
         """Gives out unrolls one after the other."""
         self._exchange()  # The first observations; the clock of the stages starts after it.
-        for _ in range(self._share.num_unrolls):
-            if self._share.link.stop_requested:
+        for _ in range(self._context.num_unrolls):
+            if self._context.link.stop_requested:
                 break
             yield self._unroll()
 
-    def _unroll(self) -> tuple[Step | None, Counts]:
+    def _unroll(self) -> tuple[CollectedStep | None, Counts]:
         counts, steps = self._no_counts, []
-        for _ in range(self._share.config.unroll_length):
+        for _ in range(self._context.config.unroll_length):
             started_s = time.perf_counter()
             self._state, self._bits, counts, step = self._program(
-                self._share.env.model, self._state, counts, *self._actions
+                self._context.env.model, self._state, counts, *self._actions
             )
             jax.block_until_ready((self._state.env.obs, self._bits))
             simulated_s = time.perf_counter()
@@ -142,21 +142,21 @@ class _Simulator:
         self._agent.send(np.asarray(self._state.env.obs), np.asarray(self._bits))
         action, log_prob = self._agent.recv()
         # Copies: the pipe's memory is used again, and jax may keep what it is given.
-        num_envs = self._share.config.envs_per_gmi
+        num_envs = self._context.config.envs_per_gmi
         self._actions = (
             action.view(np.float32).reshape(num_envs, -1).copy(),
             log_prob.view(np.float32).copy(),
         )
 
 
-def _run_agent(share: Share, simulators: Sequence[_Peer]) -> dict[str, Any]:
+def _run_agent(context: CollectorContext, simulators: Sequence[_Peer]) -> dict[str, Any]:
     """Answers the simulators until all have closed; the outcome for `result.json`."""
-    share.link.begin_compiling()
+    context.link.begin_compiling()
     started_s = time.monotonic()
-    agent = _Agent(share)
-    compile_s = time.monotonic() - started_s - share.link.start_s["waiting"]
-    share.link.beat("ready", 0)
-    share.barrier()
+    agent = _Agent(context)
+    compile_s = time.monotonic() - started_s - context.link.start_s["waiting"]
+    context.link.beat("ready", 0)
+    context.barrier()
     answered, left = 0, list(simulators)
     while left:
         for peer in tuple(left):
@@ -167,11 +167,11 @@ def _run_agent(share: Share, simulators: Sequence[_Peer]) -> dict[str, Any]:
                 continue
             peer.send(*agent.act(obs, bits))
             answered += 1
-        share.link.beat("running", answered)
+        context.link.beat("running", answered)
     for peer in simulators:
         peer.close()
     return {
-        "status": "stopped" if share.link.stop_requested else "completed",
+        "status": "stopped" if context.link.stop_requested else "completed",
         "compile_s": compile_s,
         "answered": answered,
         "stages_s": {"infer": list(agent.infer_s)},
@@ -181,13 +181,13 @@ def _run_agent(share: Share, simulators: Sequence[_Peer]) -> dict[str, Any]:
 class _Agent:
     """The compiled agent of several simulators; `infer_s`: seconds of its latest answers."""
 
-    def __init__(self, share: Share) -> None:
-        num_envs, obs_size = share.config.envs_per_gmi, share.env.spec.obs_size
+    def __init__(self, context: CollectorContext) -> None:
+        num_envs, obs_size = context.config.envs_per_gmi, context.env.spec.obs_size
         keys = jax.random.split(jax.random.key(0), num_envs)
         obs, bits = np.zeros((num_envs, obs_size), np.float32), jax.random.key_data(keys)
-        program = jax.jit(partial(infer, share.policy))
-        self.infer_s: deque[float] = deque(maxlen=share.config.latency_steps)
-        self._weights = share.policy.weights
+        program = jax.jit(partial(infer, context.policy))
+        self.infer_s: deque[float] = deque(maxlen=context.config.latency_steps)
+        self._weights = context.policy.weights
         self._shapes = obs.shape, bits.shape
         self._program: Any = compile_once(program.lower(self._weights, obs, np.asarray(bits)))
 
@@ -204,6 +204,6 @@ class _Agent:
         return answer
 
 
-def _stacked(steps: Sequence[Step]) -> Step:
+def _stacked(steps: Sequence[CollectedStep]) -> CollectedStep:
     """Steps [T, N] from T steps [N]."""
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *steps)

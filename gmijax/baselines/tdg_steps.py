@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from gmijax.collection.programs import ActingPolicy, Keep, Step
+from gmijax.collection.programs import ActingPolicy, CollectedStep, RecordSpec
 from gmijax.learning.unroll import Counts, count, outcome_of
 from gmijax.sim.wrappers import BatchedEnv, BatchState, split_keys
 from gmijax.types import Array, PyTree
@@ -17,13 +17,13 @@ from gmijax.types import Array, PyTree
 
 def simulate(
     env: BatchedEnv,
-    keep: Keep,
+    keep: RecordSpec,
     model: PyTree,
     state: BatchState,
     counts: Counts,
     action: Array,
     log_prob: Array,
-) -> tuple[BatchState, Array, Counts, Step | None]:
+) -> tuple[BatchState, Array, Counts, CollectedStep | None]:
     """The simulator's half of a step: physics, then keys for the next action.
 
     The keys of `state` are those of this step (`next_keys`); actions [N, A] and log densities [N]

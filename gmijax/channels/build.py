@@ -12,7 +12,7 @@ from gmijax.channels.compressor import Compressor, TransferSize, read_transfer
 from gmijax.channels.migrator import ChannelWriter, Migrator
 from gmijax.channels.pipe import PipeReader, PipeWriter
 from gmijax.channels.pipe_block import PipeBlock, create_pipes
-from gmijax.channels.sender import Dispenser, Packer, Sender
+from gmijax.channels.sender import Dispenser, MessageEncoder, Sender
 from gmijax.channels.tcp_channel import RemoteReader, RemoteWriter
 from gmijax.channels.unichannel import UniDecoder, UniPacker
 from gmijax.collectives.device.device_memory import DeviceMemory, NewMemory
@@ -111,7 +111,7 @@ def open_sender(
     migrator = Migrator(writers, near)
     held.callback(migrator.close)
     most = max_piece_bytes(config.capacity_bytes)
-    packer: Packer = UniPacker(migrator)
+    packer: MessageEncoder = UniPacker(migrator)
     if config.design == "multi":
         packer = Compressor(migrator, TransferSize(most), most)
     return Sender(Dispenser(rank, most), packer, migrator, on_device=False, held=held)

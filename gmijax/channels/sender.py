@@ -21,7 +21,7 @@ CLOSE_TIMEOUT_S = 5.0
 """How long an agent that closes waits for room for what it has not sent yet."""
 
 
-class Packer(Protocol):
+class MessageEncoder(Protocol):
     """What makes messages of pieces: a `Compressor`, a `UniPacker` or a `ResidentPacker`."""
 
     def try_add(self, piece: Rollouts) -> bool:
@@ -88,7 +88,7 @@ class Sender:
     """
 
     dispenser: Dispenser
-    packer: Packer
+    packer: MessageEncoder
     migrator: Migrator
     on_device: bool
     held: contextlib.ExitStack

@@ -41,7 +41,7 @@ def flatten(
       TypeError, pickle.PicklingError: something cannot be pickled, e.g. a lock.
     """
     file = io.BytesIO()
-    pickler = _Pickler(file, scalars, put)
+    pickler = _TreePickler(file, scalars, put)
     pickler.dump(tree)
     return file.getvalue(), pickler.arrays
 
@@ -78,7 +78,7 @@ def on_host(value: Any) -> npt.NDArray[Any] | None:
     return None
 
 
-class _Pickler(cloudpickle.Pickler):
+class _TreePickler(cloudpickle.Pickler):
     def __init__(self, file: io.BytesIO, scalars: bool, put: Callable[[Any], Any]) -> None:
         super().__init__(file, protocol=5)
         self.arrays: list[npt.NDArray[Any]] = []

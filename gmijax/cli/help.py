@@ -33,7 +33,7 @@ USUAL: Final = (
 """What most people set."""
 
 
-class Key(NamedTuple):
+class HelpKey(NamedTuple):
     """A key of a configuration, as `--help` and the reference show it."""
 
     choice: str  # What it belongs to, e.g. `algo=a3c`, or nothing.
@@ -119,7 +119,7 @@ def _values_of(kind: Any) -> Iterator[str]:
         yield from ("true", "false")
 
 
-def _of_topic(keys: Sequence[Key], topic: str | None, topics: Sequence[str]) -> list[Key]:
+def _of_topic(keys: Sequence[HelpKey], topic: str | None, topics: Sequence[str]) -> list[HelpKey]:
     if topic == "all" or (topic is None and len(keys) <= MANY):
         return list(keys)
     if topic is None:
@@ -131,7 +131,7 @@ def _of_topic(keys: Sequence[Key], topic: str | None, topics: Sequence[str]) -> 
     return found
 
 
-def _whose_defaults(command: str, keys: Sequence[Key]) -> str:
+def _whose_defaults(command: str, keys: Sequence[HelpKey]) -> str:
     task = next(key.default for key in keys if key.name == "env.name")
     one_job = "train" if command == "sweep" else command
     return (
@@ -149,7 +149,7 @@ def usage_of(command: str) -> str:
 
 def keys_of(
     cls: type[Any], defaults_of: Callable[[Sequence[str]], Mapping[str, Any]]
-) -> Iterator[Key]:
+) -> Iterator[HelpKey]:
     """Every key that a user may set, in the order of the dataclasses.
 
     Args:
@@ -164,7 +164,7 @@ def keys_of(
             allowed = tuple(map(str, typing.get_args(kind))) if literal else ()
             limits = metadata.get("limits", (None, None, False))
             default = _shown_default(name, values)
-            yield Key(choice, name, kind, default, metadata["doc"], allowed, limits)
+            yield HelpKey(choice, name, kind, default, metadata["doc"], allowed, limits)
 
 
 def _shown_default(key: str, values: Mapping[str, Any]) -> str:

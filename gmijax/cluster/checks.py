@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gmijax.clock import running_s
 from gmijax.cluster.node import ON_GPUS, Facts, own_versions
-from gmijax.cluster.ray_nodes import Joined
+from gmijax.cluster.ray_nodes import NodeHandle
 from gmijax.errors import ConfigError
 from gmijax.machine.differences import differences_in
 from gmijax.machine.snapshot import Machine
@@ -23,9 +23,9 @@ SHOWS_S = 20.0
 _POLL_S = 0.2
 
 
-def by_name(joined: Sequence[Joined]) -> dict[str, Joined]:
+def by_name(joined: Sequence[NodeHandle]) -> dict[str, NodeHandle]:
     """Nodes by address, in order; those after the first of a machine have their place added."""
-    named: dict[str, Joined] = {}
+    named: dict[str, NodeHandle] = {}
     for place, node in enumerate(joined):
         address = node.remote.address
         named[f"{address}#{place}" if address in named else address] = node
@@ -42,7 +42,7 @@ def differences_in_versions(nodes: Mapping[str, Facts]) -> list[str]:
     return found
 
 
-def require_alike(joined: Sequence[Joined]) -> None:
+def require_alike(joined: Sequence[NodeHandle]) -> None:
     """Raises ConfigError if nodes differ in versions from this machine, or for GPUs in between."""
     # This machine may have no GPUs: it does not use them.
     here = Facts("", Machine((), ()), own_versions())
@@ -51,7 +51,7 @@ def require_alike(joined: Sequence[Joined]) -> None:
         raise ConfigError(f"cluster.engine=ray: {problems[0]}; all nodes must have the same")
 
 
-def require_shared(joined: Sequence[Joined], run_root: Path) -> None:
+def require_shared(joined: Sequence[NodeHandle], run_root: Path) -> None:
     """Raises ConfigError if a node does not see the run folder, or what will hold it."""
     folder = run_root.absolute()
     while not folder.is_dir():

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from gmijax.cluster.checks import by_name, require_alike, require_shared
-from gmijax.cluster.node import Opened, TrainingNode
-from gmijax.cluster.ray_nodes import Joined, RayCluster
+from gmijax.cluster.node import NodeEndpoints, TrainingNode
+from gmijax.cluster.ray_nodes import NodeHandle, RayCluster
 from gmijax.collectives.nodes.rendezvous import NodeAddresses
 from gmijax.config import TrainConfig
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed
@@ -34,7 +34,7 @@ class ClusterJob:
 
     def __init__(self, config: TrainConfig) -> None:
         self._config = config
-        self._joined: list[Joined] = []
+        self._joined: list[NodeHandle] = []
         self._signals: StopSignals | None = None
         self._num_cpus = _cpus_of_a_node(config)
 
@@ -115,16 +115,16 @@ class ClusterJob:
         finally:
             self._cluster.leave()
 
-    def _open(self, launch: Launch) -> list[Opened]:
+    def _open(self, launch: Launch) -> list[NodeEndpoints]:
         """What the nodes have for their GMIs; raises BackendUnavailable with a node's address."""
         sent = dataclasses.replace(launch, on_warning=print, is_enough=None)
         daemons: dict[str, Path] = {}
-        found: list[Opened] = []
+        found: list[NodeEndpoints] = []
         for place, (node, facts) in enumerate(self._joined):
             opened = node.call("open", sent, place, facts.address, daemons)
             if isinstance(opened, BackendUnavailable):
                 raise BackendUnavailable(f"node {node.address}: {opened}")
-            found.append(opened or Opened(("", 0), {}, {}))  # None of a node that is gone.
+            found.append(opened or NodeEndpoints(("", 0), {}, {}))  # None of a node that is gone.
             daemons |= found[-1].daemons
         return found
 
@@ -138,7 +138,7 @@ class ClusterJob:
 class BackendOfNodes(Backend):
     """The backends that the nodes have entered, as the supervisor asks them."""
 
-    def __init__(self, launch: Launch, joined: Sequence[Joined]) -> None:
+    def __init__(self, launch: Launch, joined: Sequence[NodeHandle]) -> None:
         super().__init__(launch.plan, launch.machine, launch.run)
         self._nodes = [node for node, _ in joined]
 

@@ -71,7 +71,7 @@ class Facts(NamedTuple):
     versions: dict[str, str | None]
 
 
-class Opened(NamedTuple):
+class NodeEndpoints(NamedTuple):
     """What a node has for its GMIs: where they will listen, and daemons of its GPUs.
 
     Attributes:
@@ -85,7 +85,7 @@ class Opened(NamedTuple):
     daemons: dict[str, Path]
 
 
-class Seen(NamedTuple):
+class RemoteGmiStatus(NamedTuple):
     """What a node knows of a GMI; see `WatchedGmi`."""
 
     exit_code: int | None
@@ -163,7 +163,7 @@ class TrainingNode(Node):
 
     def open(
         self, launch: Launch, node: int, address: str, daemons: Mapping[str, Path]
-    ) -> Opened | BackendUnavailable:
+    ) -> NodeEndpoints | BackendUnavailable:
         """Makes what the GMIs share, or says why this machine cannot; may be called again.
 
         Args:
@@ -181,7 +181,7 @@ class TrainingNode(Node):
 
     def _open(
         self, launch: Launch, node: int, address: str, daemons: Mapping[str, Path]
-    ) -> Opened:
+    ) -> NodeEndpoints:
         self._launch = launch
         own = launch.run.node(node)
         own.root.mkdir(exist_ok=True)
@@ -194,7 +194,7 @@ class TrainingNode(Node):
         self._backend = self._held.enter_context(backend)
         found = dict(backend.daemons)
         if layout.num_nodes == 1:
-            return Opened((address, 0), {}, found)
+            return NodeEndpoints((address, 0), {}, found)
         self._listener = self._held.enter_context(listen(address))
         self._blocks[ENV_LISTENER_FD] = self._listener.fileno()
         calls = {
@@ -202,7 +202,7 @@ class TrainingNode(Node):
             for pair in launch.kind.calls(launch.plan)
             if layout.node_of(pair[0]) == node
         }
-        return Opened((address, self._listener.getsockname()[1]), calls, found)
+        return NodeEndpoints((address, self._listener.getsockname()[1]), calls, found)
 
     def set_addresses(self, nodes: NodeAddresses) -> None:
         """Takes the addresses of all leaders; GMIs can be started from here on."""
@@ -239,12 +239,12 @@ class TrainingNode(Node):
         """See `Backend.terminate`."""
         self._backend.terminate(gmi, pid)
 
-    def poll(self) -> dict[int, Seen]:
+    def poll(self) -> dict[int, RemoteGmiStatus]:
         """How every GMI is."""
         for process in self._started.values():
             process.poll()
         return {
-            gmi: Seen(one.exit_code, one.beats, one.beat, one.error, one.log_bytes)
+            gmi: RemoteGmiStatus(one.exit_code, one.beats, one.beat, one.error, one.log_bytes)
             for gmi, one in self._started.items()
         }
 

@@ -34,7 +34,7 @@ _ACTORS_S = 120.0
 _CLOSE_S = 30.0
 
 
-class Joined(NamedTuple):
+class NodeHandle(NamedTuple):
     """A node that takes part in a job."""
 
     remote: RemoteNode
@@ -73,7 +73,7 @@ class RayCluster:
         is_unwanted: Callable[[], bool] = lambda: False,
         least_gpus: int = 0,
         most_gpus: int | None = 0,
-    ) -> list[Joined]:
+    ) -> list[NodeHandle]:
         """Puts an actor on each of several nodes that have so many CPUs left.
 
         Where GPUs may be taken and there are any, only nodes with GPUs count, and each gives as
@@ -213,7 +213,7 @@ class RayCluster:
             options["num_gpus"] = bundle.get("GPU", 0)
             self._actors.append(remote.options(**options).remote(*arguments))
 
-    def _joined(self) -> list[Joined]:
+    def _joined(self) -> list[NodeHandle]:
         ray = self._ray
         try:
             asked = [actor.ask.remote("facts", __version__) for actor in self._actors]
@@ -228,7 +228,7 @@ class RayCluster:
             self.leave()
             raise ConfigError(problems[0])
         return [
-            Joined(RemoteNode(self._ask_of(actor), position, facts.address), facts)
+            NodeHandle(RemoteNode(self._ask_of(actor), position, facts.address), facts)
             for position, (actor, facts) in enumerate(zip(self._actors, answers, strict=True))
         ]
 

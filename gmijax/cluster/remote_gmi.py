@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import Any, Final, Protocol
 
 from gmijax.clock import running_s
-from gmijax.cluster.node import Seen
+from gmijax.cluster.node import RemoteGmiStatus
 from gmijax.errors import GmiFailed, NodeLost, ReportedError, lines_of
 from gmijax.runs.folder import GmiPaths
 from gmijax.supervise.watched_gmi import WatchedGmi
@@ -135,7 +135,7 @@ class RemoteGmi(WatchedGmi):
         """See `WatchedGmi`."""
         if self.exit_code is not None:
             return self.exit_code
-        seen: Seen | None = self._node.look(self.gmi)
+        seen: RemoteGmiStatus | None = self._node.look(self.gmi)
         self.is_silent = self._node.is_silent
         if seen is not None:
             self._heard(seen.beats, seen.beat)

@@ -20,7 +20,7 @@ _CLOCKS_S: Final = 1.0
 """Clocks that differ by more make times in logs and events hard to compare."""
 
 
-class Surveyed(NamedTuple):
+class NodeInfo(NamedTuple):
     """A node.
 
     Attributes:
@@ -46,7 +46,7 @@ class SurveyedNode(Node):
         return time.time()
 
 
-def survey(address: str) -> dict[str, Surveyed]:
+def survey(address: str) -> dict[str, NodeInfo]:
     """All nodes of the cluster of Ray at this address, by theirs.
 
     Args:
@@ -57,17 +57,17 @@ def survey(address: str) -> dict[str, Surveyed]:
     """
     cluster = RayCluster(ClusterConfig(engine="ray", address=address, wait_s=0.0), SurveyedNode)
     try:
-        found: dict[str, Surveyed] = {}
+        found: dict[str, NodeInfo] = {}
         for name, node in by_name(cluster.join(_LITTLE, None)).items():
             before_s = time.time()
             theirs_s = node.remote.call("clock") or 0.0
-            found[name] = Surveyed(node.facts, theirs_s - (before_s + time.time()) / 2)
+            found[name] = NodeInfo(node.facts, theirs_s - (before_s + time.time()) / 2)
         return found
     finally:
         cluster.close()
 
 
-def differences(nodes: Mapping[str, Surveyed]) -> tuple[list[str], list[str]]:
+def differences(nodes: Mapping[str, NodeInfo]) -> tuple[list[str], list[str]]:
     """What a job over these nodes would refuse, and what else is worth knowing, in sentences."""
     machines = {name: node.facts.machine for name, node in nodes.items()}
     problems = differences_in_versions({name: node.facts for name, node in nodes.items()})
@@ -81,7 +81,7 @@ def differences(nodes: Mapping[str, Surveyed]) -> tuple[list[str], list[str]]:
     return problems + on_gpus, notes
 
 
-def lines_of_nodes(nodes: Mapping[str, Surveyed]) -> Iterator[str]:
+def lines_of_nodes(nodes: Mapping[str, NodeInfo]) -> Iterator[str]:
     """Every node in a line."""
     for name, (facts, clock_s) in nodes.items():
         machine = facts.machine
@@ -93,7 +93,7 @@ def lines_of_nodes(nodes: Mapping[str, Surveyed]) -> Iterator[str]:
         )
 
 
-def nodes_as_data(nodes: Mapping[str, Surveyed]) -> list[dict[str, Any]]:
+def nodes_as_data(nodes: Mapping[str, NodeInfo]) -> list[dict[str, Any]]:
     """Plain data for `--json`."""
     return [
         {

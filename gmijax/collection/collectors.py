@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from gmijax.collection.programs import ActingPolicy, Keep, Step, unroll
+from gmijax.collection.programs import ActingPolicy, CollectedStep, RecordSpec, unroll
 from gmijax.collection.recording import CollectionStats, ShardWriter
 from gmijax.compile_once import compile_once
 from gmijax.config import ServeConfig
@@ -26,7 +26,7 @@ WARM_UP_STEPS = 10
 """Steps before the timed ones: caches, pools and clocks settle."""
 
 
-class Share(NamedTuple):
+class CollectorContext(NamedTuple):
     """One GMI's part of a serving job.
 
     Attributes:
@@ -47,9 +47,9 @@ class Share(NamedTuple):
     barrier: Callable[[], Any]
 
     @property
-    def keep(self) -> Keep:
+    def keep(self) -> RecordSpec:
         """What of every step leaves the compiled program."""
-        return Keep(self.writer is not None, self.config.output.next_obs)
+        return RecordSpec(self.writer is not None, self.config.output.next_obs)
 
     def reset(self) -> BatchState:
         """Environments at their starts.
@@ -63,7 +63,7 @@ class Share(NamedTuple):
         first_env = self.rank * num_envs
         return begin_episodes(self.env, key, first_env, num_envs, kept_steps=kept_steps)
 
-    def record(self, unrolls: Iterable[tuple[Step | None, Counts]]) -> dict[str, Any]:
+    def record(self, unrolls: Iterable[tuple[CollectedStep | None, Counts]]) -> dict[str, Any]:
         """Takes unrolls until there are no more; returns the outcome for `result.json`."""
         steps_per_unroll = self.config.envs_per_gmi * self.config.unroll_length
         stats = CollectionStats(self.link, self.env.spec.name, steps_per_unroll)
@@ -80,7 +80,7 @@ class Share(NamedTuple):
         return {"status": "completed" if is_complete else "stopped", **stats.outcome()}
 
 
-def collect(share: Share, plan: Plan) -> dict[str, Any]:
+def collect(context: CollectorContext, plan: Plan) -> dict[str, Any]:
     """Makes the unrolls of a GMI of the plan; the outcome for `result.json`.
 
     Raises:
@@ -89,51 +89,55 @@ def collect(share: Share, plan: Plan) -> dict[str, Any]:
     """
     del plan
     started_s = time.monotonic()
-    state = share.reset()
-    arguments = share.env.model, share.policy.weights
-    program = _lowered(share, share.config.unroll_length, share.keep, (*arguments, state))
+    state = context.reset()
+    arguments = context.env.model, context.policy.weights
+    program = _lowered(context, context.config.unroll_length, context.keep, (*arguments, state))
     latency_s: list[float] = []
     single = None
-    if share.config.latency_steps:
-        single = _lowered(share, 1, Keep(steps=False, next_obs=False), (*arguments, state))
-    share.link.begin_compiling()
+    if context.config.latency_steps:
+        single = _lowered(context, 1, RecordSpec(steps=False, next_obs=False), (*arguments, state))
+    context.link.begin_compiling()
     program = compile_once(program)
     single = single and compile_once(single)
-    compile_s = time.monotonic() - started_s - share.link.start_s["waiting"]
-    share.link.beat("ready", 0)
+    compile_s = time.monotonic() - started_s - context.link.start_s["waiting"]
+    context.link.beat("ready", 0)
     if single is not None:
-        share.barrier()
-        latency_s = _time_steps(share, partial(single, *arguments), state)
+        context.barrier()
+        latency_s = _time_steps(context, partial(single, *arguments), state)
         # The unrolls are to begin at the starts, whatever was timed before.
-        state = share.reset()
-    share.barrier()  # All have compiled: the clock may start.
-    outcome = share.record(_unrolls(share, partial(program, *arguments), state))
+        state = context.reset()
+    context.barrier()  # All have compiled: the clock may start.
+    outcome = context.record(_unrolls(context, partial(program, *arguments), state))
     return {"compile_s": compile_s, "latency_s": latency_s, "stages_s": {}, **outcome}
 
 
-def _lowered(share: Share, length: int, keep: Keep, arguments: tuple[Any, ...]) -> Any:
-    program = partial(unroll, share.env, share.policy, length, keep)
+def _lowered(
+    context: CollectorContext, length: int, keep: RecordSpec, arguments: tuple[Any, ...]
+) -> Any:
+    program = partial(unroll, context.env, context.policy, length, keep)
     return jax.jit(program, donate_argnums=(2,)).lower(*arguments)
 
 
-def _time_steps(share: Share, step: Any, state: Any) -> list[float]:
+def _time_steps(context: CollectorContext, step: Any, state: Any) -> list[float]:
     """Seconds of single steps of all N environments, each waited for."""
     seconds = []
-    for number in range(WARM_UP_STEPS + share.config.latency_steps):
+    for number in range(WARM_UP_STEPS + context.config.latency_steps):
         started_s = time.perf_counter()
         state, _, _ = step(state)
         jax.block_until_ready(state)
         if number >= WARM_UP_STEPS:
             seconds.append(time.perf_counter() - started_s)
-        share.link.beat("running", 0)
+        context.link.beat("running", 0)
     return seconds
 
 
-def _unrolls(share: Share, program: Any, state: Any) -> Iterator[tuple[Step | None, Counts]]:
+def _unrolls(
+    context: CollectorContext, program: Any, state: Any
+) -> Iterator[tuple[CollectedStep | None, Counts]]:
     """Gives out each unroll while the next one is computed."""
     before = None
-    for _ in range(share.num_unrolls):
-        if share.link.stop_requested:
+    for _ in range(context.num_unrolls):
+        if context.link.stop_requested:
             break
         state, *made = program(state)
         if before is not None:

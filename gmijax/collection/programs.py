@@ -79,7 +79,7 @@ def _trained(
     return choose
 
 
-class Step(NamedTuple):
+class CollectedStep(NamedTuple):
     """One step of N environments, as it is kept; over an unroll with a leading axis [T].
 
     Attributes:
@@ -100,7 +100,7 @@ class Step(NamedTuple):
     next_obs: Array | None
 
 
-class Keep(NamedTuple):
+class RecordSpec(NamedTuple):
     """What of every step a program hands out."""
 
     steps: bool
@@ -108,11 +108,11 @@ class Keep(NamedTuple):
 
     def of(
         self, before: BatchState, log_prob: Array, action: Array, out: StepOutput
-    ) -> Step | None:
+    ) -> CollectedStep | None:
         """The step, if it is kept."""
         if not self.steps:
             return None
-        return Step(
+        return CollectedStep(
             obs=before.env.obs,
             action=action,
             log_prob=log_prob,
@@ -127,11 +127,11 @@ def unroll(
     env: BatchedEnv,
     policy: ActingPolicy,
     length: int,
-    keep: Keep,
+    keep: RecordSpec,
     model: PyTree,
     weights: PyTree,
     state: BatchState,
-) -> tuple[BatchState, Step | None, Counts]:
+) -> tuple[BatchState, CollectedStep | None, Counts]:
     """T steps; returns the state, the steps [T, N] (None if not kept), and sums over all."""
 
     def choose(before: BatchState) -> tuple[BatchState, Array, Array]:
@@ -141,7 +141,7 @@ def unroll(
 
     def kept(
         before: BatchState, log_prob: Array, action: Array, out: StepOutput
-    ) -> tuple[Step | None, Array, Outcome]:
+    ) -> tuple[CollectedStep | None, Array, Outcome]:
         return keep.of(before, log_prob, action, out), out.reward, outcome_of(out)
 
     state, (steps, rewards, outcomes) = run_steps(env, choose, length, kept, model, state)

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gmijax.collection.programs import Step
+from gmijax.collection.programs import CollectedStep
 from gmijax.learning.episode_window import EpisodeWindow
 from gmijax.learning.physics_health import OverflowCount, check_diverged, overflow_line
 from gmijax.learning.training_log import JsonlSink
@@ -40,7 +40,7 @@ class ShardWriter:
         paths.folder(rank).mkdir(exist_ok=True)
         remove_temporary(paths.folder(rank))
 
-    def write(self, steps: Step) -> None:
+    def write(self, steps: CollectedStep) -> None:
         """Takes one unroll [T, N]; waits for the one before, and raises what it met."""
         self.wait()
         self._pending = self._pool.submit(self._write, self._next, steps)
@@ -61,7 +61,7 @@ class ShardWriter:
         """Ends the thread; what is being written is finished first."""
         self._pool.shutdown()
 
-    def _write(self, index: int, steps: Step) -> int:
+    def _write(self, index: int, steps: CollectedStep) -> int:
         arrays = {
             name: np.asarray(array) for name, array in steps._asdict().items() if array is not None
         }

@@ -21,7 +21,7 @@ from gmijax.collectives.device.lockstep import LockstepRunner
 from gmijax.collectives.device.nccl_ring import NcclRing
 from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.shared_memory import Fence
-from gmijax.collectives.strategies import Groups, Stage
+from gmijax.collectives.strategies import Groups, ReductionStage
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import leaders
 
@@ -108,7 +108,7 @@ class DeviceTransport(HostTransport):
         host: Group,
         layout: Layout,
         num_floats: int,
-        stages: Sequence[Stage],
+        stages: Sequence[ReductionStage],
         device: Device,
     ) -> None:
         super().__init__(host, num_floats)
@@ -132,7 +132,7 @@ class DeviceTransport(HostTransport):
             raise
 
     def _new_ipc(
-        self, layout: Layout, stages: Sequence[Stage], new_memory: NewMemory
+        self, layout: Layout, stages: Sequence[ReductionStage], new_memory: NewMemory
     ) -> IpcBuffers:
         rank, layout = self._here.rank, layout.of_node(0)
         groups = next(stage.groups for stage in stages if stage.transport == "ipc")
@@ -152,7 +152,13 @@ class DeviceTransport(HostTransport):
         self.exchange_s()  # Not a part of the first step.
 
     def reduce(
-        self, stage: Stage, stream: int, call_index: int, source: int, target: int, num_floats: int
+        self,
+        stage: ReductionStage,
+        stream: int,
+        call_index: int,
+        source: int,
+        target: int,
+        num_floats: int,
     ) -> None:
         """See `HostTransport`."""
         most = max(len(group) for group in stage.groups)

@@ -13,7 +13,7 @@ import numpy as np
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
-from gmijax.collectives.strategies import Stage
+from gmijax.collectives.strategies import ReductionStage
 from gmijax.errors import GmijaxError
 
 T = TypeVar("T")
@@ -48,7 +48,13 @@ class HostTransport:
         """
 
     def reduce(
-        self, stage: Stage, stream: int, call_index: int, source: int, target: int, num_floats: int
+        self,
+        stage: ReductionStage,
+        stream: int,
+        call_index: int,
+        source: int,
+        target: int,
+        num_floats: int,
     ) -> None:
         """`target` becomes what the stage makes of `source`.
 
@@ -118,7 +124,7 @@ class HostTransport:
         return self._pinned[use][:num_floats]
 
     def _reduce(
-        self, stage: Stage, call_index: int, values: FloatBuffer, result: FloatBuffer
+        self, stage: ReductionStage, call_index: int, values: FloatBuffer, result: FloatBuffer
     ) -> None:
         if stage.transport == "nodes":
             assert isinstance(self._host, MultiNodeGroup)

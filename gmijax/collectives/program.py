@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.interface import Step
-from gmijax.collectives.strategies import Stage
+from gmijax.collectives.strategies import ReductionStage
 from gmijax.collectives.xla_call import Buffer, register
 from gmijax.compile_once import compile_once
 from gmijax.devices import host_sharding
@@ -35,7 +35,11 @@ class StagedAllReduce:
     """One rank's all-reduces in programs, by a strategy's stages."""
 
     def __init__(
-        self, transport: HostTransport, stages: Sequence[Stage], rank: int, world_size: int
+        self,
+        transport: HostTransport,
+        stages: Sequence[ReductionStage],
+        rank: int,
+        world_size: int,
     ) -> None:
         self.rank, self.world_size = rank, world_size
         self._transport: HostTransport | None = transport

@@ -22,7 +22,7 @@ Groups: TypeAlias = tuple[tuple[int, ...], ...]
 """Ranks that exchange with each other; no rank is in two of them, some may be in none."""
 
 
-class Stage(NamedTuple):
+class ReductionStage(NamedTuple):
     """One part of a reduction.
 
     Attributes:
@@ -45,7 +45,7 @@ class Stage(NamedTuple):
         return True
 
 
-def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage]:
+def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[ReductionStage]:
     """What ranks do one after the other to have the sum over all of them, by strategy.
 
     - `mpr`, multi-process reduction: all through the host.
@@ -71,36 +71,36 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage
         return _over_nodes(stages(strategy, layout.of_node(0), intra), layout.gmis_of_node)
     gpus, everyone = layout.gmis_of_gpu, (tuple(layout.gmis),)
     if strategy == "mpr":
-        return [Stage("all_reduce", "host", everyone)]
+        return [ReductionStage("all_reduce", "host", everyone)]
     if strategy == "flat":
-        return [Stage("all_reduce", "ring", everyone)]
+        return [ReductionStage("all_reduce", "ring", everyone)]
     if strategy == "one_shot":
-        return [Stage("all_gather", "ipc", everyone)]
+        return [ReductionStage("all_gather", "ipc", everyone)]
     rings = tuple(zip(*gpus, strict=True)) if is_even(layout) else ()
     if strategy == "mrr":
         if len(rings) == 1:
-            return [Stage("all_reduce", "ring", rings)]
+            return [ReductionStage("all_reduce", "ring", rings)]
         # Ring k ends on GPU k: the ends are on different GPUs, as NCCL asks.
         ends = tuple(ring[index] for index, ring in enumerate(rings))
         back = tuple(_first(end, ring) for end, ring in zip(ends, rings, strict=True))
         return [
-            Stage("all_reduce", "ring", rings),
-            Stage("all_reduce", "ring", (ends,)),
-            Stage("broadcast", "ring", back),
+            ReductionStage("all_reduce", "ring", rings),
+            ReductionStage("all_reduce", "ring", (ends,)),
+            ReductionStage("broadcast", "ring", back),
         ]
     inner: TransportName = "ipc" if intra == "ipc" else "host"
     led = tuple(_first(leader, gpu) for leader, gpu in zip(leaders(layout), gpus, strict=True))
-    inside = Stage("all_gather" if inner == "ipc" else "all_reduce", inner, led)
+    inside = ReductionStage("all_gather" if inner == "ipc" else "all_reduce", inner, led)
     if len(gpus) == 1:
         return [inside]
     if inner == "ipc" and rings:
         # Not a sum of NCCL's: its order may differ from ring to ring.
-        return [inside, Stage("all_gather", "ring", rings)]
-    between = Stage("all_reduce", "ring", (leaders(layout),))
-    return [inside, between, Stage("broadcast", inner, led)]
+        return [inside, ReductionStage("all_gather", "ring", rings)]
+    between = ReductionStage("all_reduce", "ring", (leaders(layout),))
+    return [inside, between, ReductionStage("broadcast", inner, led)]
 
 
-def _over_nodes(inside: Sequence[Stage], nodes: Groups) -> Sequence[Stage]:
+def _over_nodes(inside: Sequence[ReductionStage], nodes: Groups) -> Sequence[ReductionStage]:
     """What one node does as done by all, and the sum over nodes."""
     if len(nodes[0]) == 1:
         inside = []
@@ -112,7 +112,7 @@ def _over_nodes(inside: Sequence[Stage], nodes: Groups) -> Sequence[Stage]:
         )
         for stage in inside
     ]
-    return [*everywhere, Stage("all_reduce", "nodes", nodes)]
+    return [*everywhere, ReductionStage("all_reduce", "nodes", nodes)]
 
 
 def _first(leader: int, group: Sequence[int]) -> tuple[int, ...]:

@@ -21,7 +21,7 @@ from gmijax.supervise.job_kinds import training_plan
 C = TypeVar("C", TrainConfig, ServeConfig)
 
 
-class Decided(NamedTuple, Generic[C]):
+class JobSpec(NamedTuple, Generic[C]):
     """A job that is ready to start.
 
     Attributes:
@@ -43,7 +43,7 @@ def with_task(config: C) -> C:
     return dataclasses.replace(config, env=source.pinned(config.env))
 
 
-def decide(config: C, console: Console, nodes: Mapping[str, Machine] | None = None) -> Decided[C]:
+def decide(config: C, console: Console, nodes: Mapping[str, Machine] | None = None) -> JobSpec[C]:
     """Numbers of GMIs and environments, plan, reduction and physics of a job, in this order.
 
     `nodes` are the machines of a job on several, by address.
@@ -62,4 +62,4 @@ def decide(config: C, console: Console, nodes: Mapping[str, Machine] | None = No
     platform = "cpu" if plan.backend == "cpu" else "gpu"
     impl, why = choose_impl(config.physics.impl, platform, config.env.label)
     config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, impl=impl))
-    return Decided(config, plan, machine, (*found, f"physics.impl {impl}: {why}"))
+    return JobSpec(config, plan, machine, (*found, f"physics.impl {impl}: {why}"))

@@ -22,7 +22,7 @@ from gmijax.cluster.cluster_job import ClusterJob
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import Show, announce, nearby, open_console, print_next
-from gmijax.control.decide import Decided, decide, with_task
+from gmijax.control.decide import JobSpec, decide, with_task
 from gmijax.control.films import filmed, find_opengl
 from gmijax.control.progress import ConsoleProgress
 from gmijax.control.restarts import (
@@ -103,7 +103,7 @@ def train(config: TrainConfig, *, show: Show = False) -> Result:
 
 
 def _train(
-    decided: Decided[TrainConfig],
+    decided: JobSpec[TrainConfig],
     beginning: StartPoint,
     console: Console,
     cluster: ClusterJob | None,
@@ -117,7 +117,7 @@ def _train(
             f"{plan.strategy}"
         )
         announce(console, run, plan, what, (*decided.reasons, *notes))
-        job = _Job(decided, run, folder, console, cluster, opengl)
+        job = _TrainingJob(decided, run, folder, console, cluster, opengl)
         try:
             job.run_to_the_end(beginning, started_s)
         finally:
@@ -129,7 +129,7 @@ def _train(
     return Result(run.root, summary)
 
 
-class Opened(NamedTuple):
+class HeldRun(NamedTuple):
     """A run folder that a job holds."""
 
     run: RunPaths
@@ -138,7 +138,7 @@ class Opened(NamedTuple):
 
 
 @contextmanager
-def opened(config: TrainConfig, beginning: StartPoint) -> Iterator[Opened]:
+def opened(config: TrainConfig, beginning: StartPoint) -> Iterator[HeldRun]:
     """The run folder of a job, held while it is entered.
 
     Raises:
@@ -151,15 +151,15 @@ def opened(config: TrainConfig, beginning: StartPoint) -> Iterator[Opened]:
     run = beginning.open(config)
     with locked(run.lock, f"run.dir={run.root}") as folder:
         record_git(run, Path.cwd())
-        yield Opened(run, notes, folder)
+        yield HeldRun(run, notes, folder)
 
 
-class _Job:
+class _TrainingJob:
     """A training job that is ready to start."""
 
     def __init__(
         self,
-        decided: Decided[TrainConfig],
+        decided: JobSpec[TrainConfig],
         run: RunPaths,
         folder: OpenFolder,
         console: Console,

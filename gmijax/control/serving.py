@@ -61,7 +61,7 @@ class Served(NamedTuple):
     data_dir: Path | None
 
 
-class _Job(NamedTuple):
+class _ServingJob(NamedTuple):
     """A serving job that is ready to start."""
 
     config: ServeConfig
@@ -136,7 +136,7 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
     return Served(run.root, summary, None if job.data is None else job.data.root)
 
 
-def _prepared(config: ServeConfig, console: Console) -> _Job:
+def _prepared(config: ServeConfig, console: Console) -> _ServingJob:
     """Everything that can be checked and decided without starting anything."""
     config = with_task(config)
     require_new_run(None, config.run.name)  # Before a search, which takes minutes.
@@ -152,7 +152,7 @@ def _prepared(config: ServeConfig, console: Console) -> _Job:
     assert group is not None
     if config.run.dir is not None and (unknown := left_out(Path(config.run.dir))):
         reasons = (*reasons, unknown)
-    return _Job(config, plan, machine, group.gmis, data, reasons)
+    return _ServingJob(config, plan, machine, group.gmis, data, reasons)
 
 
 def _with_checkpoint(config: ServeConfig) -> ServeConfig:
@@ -179,7 +179,7 @@ def _with_checkpoint(config: ServeConfig) -> ServeConfig:
     return dataclasses.replace(config, run=run, physics=physics)
 
 
-def _about(job: _Job) -> dict[str, Any]:
+def _about(job: _ServingJob) -> dict[str, Any]:
     """What all experience in one folder has in common, as it comes back from JSON."""
     config = job.config
     about = {
@@ -233,7 +233,7 @@ class _CollectedLines:
 
 
 def _run(
-    job: _Job, kept: int, run: RunPaths, folders: Sequence[OpenFolder], console: Console
+    job: _ServingJob, kept: int, run: RunPaths, folders: Sequence[OpenFolder], console: Console
 ) -> dict[str, Any]:
     """Runs the GMIs; returns the summary, which is written however they end.
 
@@ -267,7 +267,7 @@ def _run(
     return read_json(run.summary)
 
 
-def _output(job: _Job, kept: int) -> dict[str, Any] | None:
+def _output(job: _ServingJob, kept: int) -> dict[str, Any] | None:
     """Content of the output folder, None without one."""
     if job.data is None:
         return None
@@ -281,7 +281,7 @@ def _output(job: _Job, kept: int) -> dict[str, Any] | None:
     }
 
 
-def _what_is_left(job: _Job) -> str:
+def _what_is_left(job: _ServingJob) -> str:
     if job.data is None:
         return "nothing was to be written"
     done = job.finished_unrolls()
@@ -291,7 +291,7 @@ def _what_is_left(job: _Job) -> str:
     )
 
 
-def _announce(console: Console, job: _Job, kept: int, run: RunPaths) -> None:
+def _announce(console: Console, job: _ServingJob, kept: int, run: RunPaths) -> None:
     plan = job.plan
     what = (
         f"template {plan.template}, {plan.num_envs_per_gmi} environments in each of "

@@ -38,7 +38,7 @@ DistillLearner: TypeAlias = Learner[DistillConfig]
 """`extra` is the `Teacher`."""
 
 
-class Samples(NamedTuple):
+class DistillSamples(NamedTuple):
     """Inputs of the loss; leading axes are [T, N], [T * N] or [B].
 
     Attributes:
@@ -94,7 +94,7 @@ def _rollout(
     model: PyTree,
     state: TrainState,
     env_state: BatchState,
-) -> tuple[BatchState, Samples, RolloutSums]:
+) -> tuple[BatchState, DistillSamples, RolloutSums]:
     """T steps of the student, with the teacher's actions."""
     weights = acting_weights(learner, state)
 
@@ -111,14 +111,14 @@ def _rollout(
         env_state,
     )
     seen = moments_of(without_outliers(weights.moments, raw_obs), 2)
-    samples = Samples(normalize(weights.moments, raw_obs), learner.extra.action(raw_obs))
+    samples = DistillSamples(normalize(weights.moments, raw_obs), learner.extra.action(raw_obs))
     return env_state, samples, RolloutSums(seen, count(rewards, outcomes))
 
 
 def _gradients(
     learner: DistillLearner,
     params: ActorCriticParams,
-    samples: Samples,
+    samples: DistillSamples,
     context: None,
     indices: Array,
 ) -> tuple[ActorCriticParams, DistillLosses]:

@@ -20,7 +20,7 @@ from gmijax.runs.resume import CheckpointMeta
 from gmijax.types import PyTree
 
 
-class Part(NamedTuple):
+class CheckpointPart(NamedTuple):
     """What this GMI has for the checkpoint of a run, on the host.
 
     Attributes:
@@ -53,7 +53,7 @@ class CheckpointSaver:
     def __init__(self, gmi: int, comm: Communicator, keep: int | None) -> None:
         self._gmi, self._comm, self._keep = gmi, comm, keep
         self._thread = ReportThread(_call)
-        self._unnamed: Sequence[Part] = ()
+        self._unnamed: Sequence[CheckpointPart] = ()
         self.last_steps: int | None = None
 
     @property
@@ -67,7 +67,7 @@ class CheckpointSaver:
         self._thread.wait()
         return bool(self._unnamed)
 
-    def begin(self, parts: Sequence[Part]) -> None:
+    def begin(self, parts: Sequence[CheckpointPart]) -> None:
         """Begins to write a checkpoint of every run."""
         self.finish()
 

@@ -10,7 +10,7 @@ WINDOW_EPISODES = 100
 """Means over episodes are taken over at least this many of the latest ones."""
 
 
-class Ended(NamedTuple):
+class EpisodeTotals(NamedTuple):
     """Sums over the episodes that ended in one iteration, as `EpisodeSums`, on the host.
 
     `at` is the number of environment steps that were simulated by its end.
@@ -52,14 +52,14 @@ class EpisodeWindow:
     def __init__(self, limit_steps: float = 0.0) -> None:
         self._limit = limit_steps
         self._steps = self._began = self._count = 0.0
-        self._ended: deque[Ended] = deque()
+        self._ended: deque[EpisodeTotals] = deque()
 
     def add(self, episodes: Any, steps: float = 0.0) -> None:
         """Takes in the `EpisodeSums` of `steps` environment steps, as numbers of the host."""
         self._steps += steps
         if not episodes.count:
             return
-        self._ended.append(Ended(self._steps, *episodes))
+        self._ended.append(EpisodeTotals(self._steps, *episodes))
         self._count += episodes.count
         oldest = self._ended[0]
         while (
@@ -108,11 +108,11 @@ class EpisodeWindow:
         """
         self._steps = state["steps"]
         self._began = state["began"] if worlds_go_on else self._steps
-        self._ended = deque(Ended(**one) for one in state["ended"])
+        self._ended = deque(EpisodeTotals(**one) for one in state["ended"])
         self._count = sum(one.count for one in self._ended)
 
 
-def _means(ended: Sequence[Ended] | deque[Ended]) -> dict[str, float | None]:
+def _means(ended: Sequence[EpisodeTotals] | deque[EpisodeTotals]) -> dict[str, float | None]:
     count = sum(one.count for one in ended)
     if not count:
         return {"return": None, "episode_length": None}

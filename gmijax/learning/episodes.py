@@ -28,7 +28,7 @@ CHUNK_STEPS = 50
 """Steps of the compiled program: at most so many are wasted after the last episode's end."""
 
 
-class Options(NamedTuple):
+class EpisodeOptions(NamedTuple):
     """How to run episodes.
 
     Attributes:
@@ -57,7 +57,7 @@ class EpisodeRunner:
       options: how to run, and how many episodes.
     """
 
-    def __init__(self, env: Env, learner: Learner, options: Options) -> None:
+    def __init__(self, env: Env, learner: Learner, options: EpisodeOptions) -> None:
         length, most = env.spec.episode_length, options.max_steps
         self._limit = length if most is None else min(most, length)
         self._model, self._options = env.model, options
@@ -120,7 +120,7 @@ def run_episodes(
     env: Env,
     learner: Learner,
     state: TrainState,
-    options: Options,
+    options: EpisodeOptions,
     on_progress: Callable[[int], None],
 ) -> Episodes:
     """Compiles and runs episodes, once.
@@ -154,7 +154,7 @@ def _begin(env: Env, num_shown: int, model: PyTree, keys: PRNGKey) -> tuple[Batc
 def _run_chunk(
     env: Env,
     learner: Learner,
-    options: Options,
+    options: EpisodeOptions,
     model: PyTree,
     state: TrainState,
     limit: Array,

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from gmijax.collectives.interface import Communicator
 from gmijax.config import TrainConfig
 from gmijax.learning.episode_films import EpisodeFilms
-from gmijax.learning.episodes import EpisodeRunner, Episodes, Options
+from gmijax.learning.episodes import EpisodeOptions, EpisodeRunner, Episodes
 from gmijax.learning.learner import Learner, TrainState
 from gmijax.runs.folder import RunPaths
 from gmijax.sim.interface import Env
@@ -94,7 +94,7 @@ class Evaluator:
         num_envs = -(-self._num_episodes // comm.world_size)
         first = comm.rank * num_envs
         self._num_own = min(max(0, self._num_episodes - first), num_envs)
-        options = Options(
+        options = EpisodeOptions(
             num_envs=num_envs,
             num_shown=self._num_recorded(config),
             seed=config.seed,

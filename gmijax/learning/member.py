@@ -19,12 +19,12 @@ from gmijax.config import TrainConfig
 from gmijax.errors import NonFiniteError, ReportedError
 from gmijax.learning.algorithm import IterationMetrics
 from gmijax.learning.checkpoint import checkpoint_meta, on_host, require_finite, save_episodes
-from gmijax.learning.checkpoint_saver import Part
+from gmijax.learning.checkpoint_saver import CheckpointPart
 from gmijax.learning.evaluator import Evaluation
 from gmijax.learning.learner import TrainState
 from gmijax.learning.policy_file import save_policy
 from gmijax.learning.start import first_window
-from gmijax.learning.training_log import Learnt, TrainingLog
+from gmijax.learning.training_log import TrainingLog, UpdateMetrics
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.types import PyTree
 
@@ -67,8 +67,8 @@ class Member:
         state: TrainState | None,
         env_state: PyTree | None,
         evaluation: Evaluation | None,
-    ) -> Part:
-        """What a checkpoint holds of it; see `Part`."""
+    ) -> CheckpointPart:
+        """What a checkpoint holds of it; see `CheckpointPart`."""
         config, run, episodes = self.config, self.run, self.log.episodes()
         evaluated = None if evaluation is None else evaluation.mean_return
         meta = checkpoint_meta(config, env_steps, num_gmis, self.log.standing(), evaluated)
@@ -77,7 +77,7 @@ class Member:
             save_policy(run, env_steps, config.env, config.algo, host_state)
             save_episodes(run, env_steps, config, episodes)
 
-        return Part(run, meta, state, env_state, save_more)
+        return CheckpointPart(run, meta, state, env_state, save_more)
 
     def median_rate(self, steps_per_iteration: int) -> float | None:
         """Environment steps per second of its median iteration."""
@@ -139,7 +139,7 @@ class Members:
         evaluation: Evaluation | None,
         *,
         is_leader: bool,
-    ) -> list[Part]:
+    ) -> list[CheckpointPart]:
         """What a checkpoint holds of each run whose weights, `learned`, are finite.
 
         All arguments may be donated afterwards.
@@ -195,7 +195,7 @@ def report(
       NonFiniteError: see `TrainingLog.write`.
     """
     host: Any = jax.tree.map(float, jax.device_get(metrics))
-    learnt = Learnt(host.losses._asdict(), host.figures, host.rates)
+    learnt = UpdateMetrics(host.losses._asdict(), host.figures, host.rates)
     if evaluation is None:
         log.write(env_steps, host.counts, learnt, times)
         return

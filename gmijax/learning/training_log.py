@@ -73,7 +73,7 @@ class TensorBoardSink:
 Sink: TypeAlias = JsonlSink | TensorBoardSink
 
 
-class Learnt(NamedTuple):
+class UpdateMetrics(NamedTuple):
     """Figures of the updates behind one line, as numbers of the host.
 
     Attributes:
@@ -148,7 +148,7 @@ class TrainingLog:
         self,
         env_steps: int,
         counts: Any,
-        learnt: Learnt,
+        learnt: UpdateMetrics,
         others: Line,
         *,
         simulated: float | None = None,

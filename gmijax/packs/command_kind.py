@@ -27,10 +27,10 @@ from gmijax.packs.template import fill
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.runs.history import copy_history
 from gmijax.supervise.start_gmi import program_cache
-from gmijax.sweeps.children import Process, Seen
-from gmijax.sweeps.kind import Start
+from gmijax.sweeps.children import ChildStatus, Process
+from gmijax.sweeps.kind import JobStart
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.running import Outcome, Running
+from gmijax.sweeps.running import JobOutcome, Running
 from gmijax.sweeps.slots import Slot
 
 _CLIENT_AFTER_S: Final = 30.0
@@ -99,7 +99,7 @@ class CommandKind:
         del queue, alone
         return (job,)
 
-    def start(self, jobs: tuple[CommandJob, ...], slot: Slot) -> Start:
+    def start(self, jobs: tuple[CommandJob, ...], slot: Slot) -> JobStart:
         """See `Kind`."""
         (job,) = jobs
         number, settings = job.number, self._settings
@@ -138,7 +138,7 @@ class CommandKind:
         # On CPU cores alone nothing is compiled that others could use.
         mark = _mark_of(job, self._names[slot.site]) if slot.devices else None
         reader = _Recorder(progress, run.metrics, mark)
-        return Start(process, (reader,), is_awaited=mark is not None and not mark.exists())
+        return JobStart(process, (reader,), is_awaited=mark is not None and not mark.exists())
 
     def _variables(self, job: CommandJob, run_dir: Path, cores: int) -> dict[str, str]:
         values = job.values(run_dir)
@@ -184,18 +184,18 @@ class CommandKind:
             job.progress.note = running.host.why_no_client(running.child)
         attempt.is_client = job.progress.note is None
 
-    def outcome(self, running: Running[CommandJob], job: CommandJob) -> Outcome:
+    def outcome(self, running: Running[CommandJob], job: CommandJob) -> JobOutcome:
         """See `Kind`."""
-        seen = running.look() or Seen(None)
+        seen = running.look() or ChildStatus(None)
         if running.hung is not None:
-            return Outcome(error=running.hung, is_fault=True)
+            return JobOutcome(error=running.hung, is_fault=True)
         # One that was asked may save and end as if it were complete.
         if running.is_killed or running.is_asked:
-            return Outcome(is_interrupted=True)
+            return JobOutcome(is_interrupted=True)
         if seen.exit_code is None:
-            return Outcome(error=running.host.lost, is_fault=True)
+            return JobOutcome(error=running.host.lost, is_fault=True)
         if seen.exit_code == 0:
-            return Outcome()
+            return JobOutcome()
         attempt = self._attempts[job.number]
         why = failure_of(seen.exit_code, self._paths.log(job.number), attempt.begins)
         is_shared = running.slot.backend in ("mps", "mig") and not running.slot.is_alone
@@ -207,7 +207,7 @@ class CommandKind:
             # It had saved nothing yet: there is nothing to go on from.
             self._from_nothing.add(job.number)
             again = "from its beginning"
-        return Outcome(
+        return JobOutcome(
             error=why.error,
             is_fault=True,
             may_be_anothers=alone,

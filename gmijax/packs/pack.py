@@ -23,8 +23,8 @@ from gmijax.packs.command_job import (
     templates_of,
 )
 from gmijax.packs.command_kind import CommandKind, PackPaths
-from gmijax.packs.crowd import MOST_CLIENTS, Crowd
 from gmijax.packs.progress import own_patterns
+from gmijax.packs.slot_limiter import MOST_CLIENTS, SlotLimiter
 from gmijax.packs.template import require_names
 from gmijax.runs.folder import RUNS, RunPaths, given_run, read_json
 from gmijax.supervise.run_gmis import StopSignals
@@ -45,7 +45,7 @@ class PackWork(Work[CommandJob]):
 
     name = "pack"
     sameness = "command and lists"
-    crowds: list[Crowd] = field(default_factory=list[Crowd], compare=False)
+    limiters: list[SlotLimiter] = field(default_factory=list[SlotLimiter], compare=False)
 
     @property
     def ranking(self) -> PackConfig:
@@ -124,8 +124,8 @@ class PackWork(Work[CommandJob]):
         most = [max(1, len(site.plan.allocations)) for site in sites]
 
         def at_once(slot: Slot) -> int:
-            if self.crowds and slot.devices:
-                return self.crowds[-1].at_once(slot)
+            if self.limiters and slot.devices:
+                return self.limiters[-1].at_once(slot)
             gpus = sites[slot.site].plan.layout.num_gpus
             return most[slot.site] // gpus if slot.devices else most[slot.site]
 
@@ -138,8 +138,8 @@ class PackWork(Work[CommandJob]):
         """See `Work`."""
         if not self.is_adaptive or not sites[0].machine.gpus:
             return None
-        self.crowds.append(Crowd(slots, sites, hosts, console))
-        return self.crowds[-1]
+        self.limiters.append(SlotLimiter(slots, sites, hosts, console))
+        return self.limiters[-1]
 
     def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """See `Work`."""
@@ -161,9 +161,9 @@ class PackWork(Work[CommandJob]):
         """See `Work`."""
         pack = to_dict(self.settings)
         pack["env"] = sorted(pack["env"])  # Names alone: values may be secret.
-        crowd = self.crowds[-1].decisions if self.crowds else []
+        decisions = self.limiters[-1].decisions if self.limiters else []
         commands = {shlex.join(job.command): None for job in self.jobs}
-        return {"pack": pack, "commands": list(commands), "at_once": crowd}
+        return {"pack": pack, "commands": list(commands), "at_once": decisions}
 
     def identity(self) -> dict[str, Any]:
         """See `Work`."""

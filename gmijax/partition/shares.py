@@ -122,7 +122,7 @@ def _sm_percents(
     return caps
 
 
-class _Home(NamedTuple):
+class _Binding(NamedTuple):
     """Where a GMI lives."""
 
     device: str  # UUID of the GPU or of the MIG instance.
@@ -131,21 +131,21 @@ class _Home(NamedTuple):
     profile: str | None  # Of the MIG instance, None for a whole GPU.
 
 
-def _homes_of(layout: Layout, gpus: Sequence[Gpu], backend: BackendName) -> list[_Home]:
+def _homes_of(layout: Layout, gpus: Sequence[Gpu], backend: BackendName) -> list[_Binding]:
     """The home of every GMI, in order of id."""
-    homes: dict[int, _Home] = {}
+    homes: dict[int, _Binding] = {}
     for place, (gpu, gmis) in enumerate(zip(gpus, layout.gmis_of_gpu, strict=True)):
         if backend != "mig":
-            homes |= dict.fromkeys(gmis, _Home(gpu.uuid, (place, None), None))
+            homes |= dict.fromkeys(gmis, _Binding(gpu.uuid, (place, None), None))
             continue
         chosen = assign_instances([one.num_sms for one in gpu.instances], len(gmis))
         for gmi, number in zip(gmis, chosen, strict=True):
             one = gpu.instances[number]
-            homes[gmi] = _Home(one.uuid, (place, one.gpu_instance), one.profile)
+            homes[gmi] = _Binding(one.uuid, (place, one.gpu_instance), one.profile)
     return [homes[gmi] for gmi in layout.gmis]
 
 
-def _require_room_for_clients(homes: Sequence[_Home], machine: Machine) -> None:
+def _require_room_for_clients(homes: Sequence[_Binding], machine: Machine) -> None:
     new = machine.driver_major >= _NEW_DRIVER
     whole = _CLIENTS_OF_NEW_DRIVERS if new else _CLIENTS_OF_OLD_DRIVERS
     for (_, profile), most in Counter((home.device, home.profile) for home in homes).items():

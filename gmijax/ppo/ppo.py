@@ -29,7 +29,7 @@ from gmijax.learning.normalize import Moments, merge_all, moments_of, std_of
 from gmijax.learning.policy import ActorCriticParams
 from gmijax.learning.updates import exchange_size, explained_variance, minibatch_order, run_updates
 from gmijax.ppo.loss import PpoLosses, UpdateContext, ppo_loss
-from gmijax.ppo.rollout import PpoLearner, Samples, Trajectory, rollout, valued_anew
+from gmijax.ppo.rollout import PpoLearner, RolloutTrajectory, Samples, rollout, valued_anew
 from gmijax.ppo.statistics import RolloutStats, merge_stats
 from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.types import Array, PyTree
@@ -57,7 +57,7 @@ def learn(
     state: TrainState,
     samples: Samples,
     stats: RolloutStats,
-    trajectory: Trajectory | None = None,
+    trajectory: RolloutTrajectory | None = None,
 ) -> tuple[TrainState, IterationMetrics]:
     """All updates of an iteration, on samples [T, N] and this GMI's statistics.
 
@@ -100,7 +100,7 @@ def _updates_by_pass(
     collectives: Collectives,
     state: TrainState,
     samples: Samples,
-    trajectory: Trajectory,
+    trajectory: RolloutTrajectory,
     context: UpdateContext,
     passes: Array,
     after: RolloutStats,

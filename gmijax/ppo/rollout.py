@@ -39,7 +39,7 @@ class Samples(NamedTuple):
     advantage: Array
 
 
-class Trajectory(NamedTuple):
+class RolloutTrajectory(NamedTuple):
     """What, with values of the observations, advantages follow from.
 
     Attributes:
@@ -63,7 +63,7 @@ def rollout(
     model: PyTree,
     weights: ActingWeights,
     env_state: BatchState,
-) -> tuple[BatchState, Samples, Trajectory, RolloutStats]:
+) -> tuple[BatchState, Samples, RolloutTrajectory, RolloutStats]:
     """Runs T steps.
 
     Returns:
@@ -86,7 +86,9 @@ def rollout(
     next_obs = normalize(weights.moments, out.next_obs)
     next_outputs = networks.state_value(weights.params, next_obs)
     rewards = config.reward_scaling * out.reward
-    trajectory = Trajectory(rewards, out.terminated, out.truncated, next_outputs, next_obs[-1:])
+    trajectory = RolloutTrajectory(
+        rewards, out.terminated, out.truncated, next_outputs, next_obs[-1:]
+    )
     advantage = _advantages(config, trajectory, values, in_rewards(weights, next_outputs))
     log_prob = networks.distribution.log_prob(output, weights.params.log_std, action)
     stats = RolloutStats(
@@ -101,7 +103,7 @@ def rollout(
 
 
 def valued_anew(
-    learner: PpoLearner, weights: ActingWeights, samples: Samples, trajectory: Trajectory
+    learner: PpoLearner, weights: ActingWeights, samples: Samples, trajectory: RolloutTrajectory
 ) -> Samples:
     """`samples` [T, N] with values and advantages by other weights than those that acted."""
     rows = jnp.concatenate([samples.obs, trajectory.last_obs.astype(samples.obs.dtype)])
@@ -112,7 +114,9 @@ def valued_anew(
     return samples._replace(value=values[:-1], advantage=advantage)
 
 
-def _advantages(config: PpoConfig, steps: Trajectory, values: Array, next_values: Array) -> Array:
+def _advantages(
+    config: PpoConfig, steps: RolloutTrajectory, values: Array, next_values: Array
+) -> Array:
     """[T, N]; see `gae`."""
     return gae(
         steps.reward,

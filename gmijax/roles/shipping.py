@@ -21,11 +21,11 @@ def dump(value: Any) -> bytes:
       TypeError, pickle.PicklingError: something cannot be pickled.
     """
     file = io.BytesIO()
-    _Pickler(file).dump(value)
+    _RolePickler(file).dump(value)
     return file.getvalue()
 
 
-class _Pickler(cloudpickle.Pickler):
+class _RolePickler(cloudpickle.Pickler):
     def reducer_override(self, obj: Any) -> Any:
         if type(obj).__module__.partition(".")[0] in ("jax", "jaxlib"):
             array = on_host(obj)

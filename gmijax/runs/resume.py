@@ -89,7 +89,7 @@ def _digest(data: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
-class Found(NamedTuple):
+class NewestCheckpoint(NamedTuple):
     """Checkpoints of a run folder."""
 
     checkpoint: Path | None  # The newest one that is whole, None if there is none.
@@ -112,15 +112,15 @@ def drop_unfinished(run: RunPaths) -> None:
             shutil.rmtree(hidden, ignore_errors=True)
 
 
-def newest_checkpoint(folder: Path) -> Found:
+def newest_checkpoint(folder: Path) -> NewestCheckpoint:
     """The newest checkpoint of a run folder whose files are as they were written."""
     passed_over: list[str] = []
     for checkpoint in reversed(checkpoints_of(folder)):
         wrong = what_is_broken(checkpoint)
         if wrong is None:
-            return Found(checkpoint.resolve(), tuple(passed_over))
+            return NewestCheckpoint(checkpoint.resolve(), tuple(passed_over))
         passed_over.append(f"checkpoint {checkpoint}: passed over, {wrong}")
-    return Found(None, tuple(passed_over))
+    return NewestCheckpoint(None, tuple(passed_over))
 
 
 def best_checkpoint(folder: Path) -> Path | None:
@@ -204,7 +204,7 @@ def find_checkpoint(wanted: str, key: str) -> Path:
 
 
 def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
-    """The checkpoint that `wanted` names, and what was passed over for it (see `Found`).
+    """The checkpoint that `wanted` names, and what was passed over for it.
 
     A checkpoint folder, a run folder (its newest one that is whole), or `last`: the run below
     `runs/` with the newest checkpoint.

@@ -18,7 +18,7 @@ Values = npt.NDArray[np.float64]
 _QUARTILES = (25, 75)
 
 
-class Middle(NamedTuple):
+class SeedSummary(NamedTuple):
     """Interquartile mean over seeds, and the quartiles (as rliable has it, arXiv 2108.13264)."""
 
     mean: Values
@@ -26,13 +26,13 @@ class Middle(NamedTuple):
     high: Values
 
 
-def middle_of(values: Values) -> Middle:
+def seed_summary(values: Values) -> SeedSummary:
     """Of values [K, ...] of K seeds."""
     low, high = np.percentile(values, _QUARTILES, axis=0)
     inside = (values >= low) & (values <= high)
     # With two or three seeds the quartiles lie between them, and nothing else does.
     inside |= ~inside.any(axis=0)
-    return Middle((values * inside).sum(axis=0) / inside.sum(axis=0), low, high)
+    return SeedSummary((values * inside).sum(axis=0) / inside.sum(axis=0), low, high)
 
 
 def without_seed(overrides: Mapping[str, str]) -> dict[str, str]:
@@ -64,7 +64,7 @@ def settings_of(rows: Sequence[Row], ranking: Ranking) -> list[dict[str, Any]]:
 
 def _setting(rows: Sequence[Row]) -> dict[str, Any]:
     ranked = [row for row in rows if row["value"] is not None]
-    middle = middle_of(np.array([row["value"] for row in ranked])) if ranked else None
+    middle = seed_summary(np.array([row["value"] for row in ranked])) if ranked else None
     return {
         "overrides": without_seed(rows[0]["overrides"]),
         "jobs": [row["job"] for row in rows],

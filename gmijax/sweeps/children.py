@@ -21,7 +21,7 @@ _STAY_S = 15.0
 """Longest wait for the rest of a process group whose leader has ended."""
 
 
-class Seen(NamedTuple):
+class ChildStatus(NamedTuple):
     """What is known of a child.
 
     Attributes:
@@ -112,16 +112,16 @@ class Child:
         """Its number; that of its process group too."""
         return self._process.pid
 
-    def look(self) -> Seen:
+    def look(self) -> ChildStatus:
         """How it is; it has ended when its process group has, or is late with that."""
         code = self._process.poll()
         if code is None:
-            return Seen(None)
+            return ChildStatus(None)
         self._ended_s = self._ended_s or running_s()
         is_late = running_s() - self._ended_s >= _STAY_S
         if members_of(self.pid) and (self._is_asked or not is_late):
-            return Seen(None)
-        return Seen(code, last_line(self._log))
+            return ChildStatus(None)
+        return ChildStatus(code, last_line(self._log))
 
     def ask_to_stop(self) -> None:
         """Asks it to save and end.

@@ -24,7 +24,7 @@ _LEAST_WINDOW_S: Final = 20.0
 _LONGEST_WINDOW_S: Final = 120.0
 
 
-class Seen(NamedTuple):
+class JobProgress(NamedTuple):
     """How far a job is that runs.
 
     Attributes:
@@ -36,7 +36,7 @@ class Seen(NamedTuple):
     reports: int
 
 
-class Measured(NamedTuple):
+class MeasuredRate(NamedTuple):
     """Sum of the rates of some jobs at once.
 
     Attributes:
@@ -77,10 +77,10 @@ class Density:
         self.most = max(1, most)
         self.target = start
         self.is_settled = self.most == 1
-        self.measured: dict[int, Measured] = {}
-        self._window: _Window | None = None
+        self.measured: dict[int, MeasuredRate] = {}
+        self._window: _RateWindow | None = None
 
-    def look(self, now_s: float, jobs: Mapping[int, Seen]) -> Decision | None:
+    def look(self, now_s: float, jobs: Mapping[int, JobProgress]) -> Decision | None:
         """Takes in how far all jobs of the GPU are; returns what to change, if anything.
 
         Args:
@@ -92,7 +92,7 @@ class Density:
             return None
         if self._window is None or not self._window.goes_on(jobs):
             is_warm = all(seen.reports >= _WARM_REPORTS for seen in jobs.values())
-            self._window = _Window(now_s, jobs) if is_warm else None
+            self._window = _RateWindow(now_s, jobs) if is_warm else None
             return None
         found = self._window.look(now_s, jobs)
         before = self._smaller()
@@ -121,7 +121,7 @@ class Density:
         self.most = max(1, min(self.most, count - 1))
         return self.settle(self.most, why) if self.target > self.most else None
 
-    def _next(self, found: Measured, before: Measured | None) -> Decision | None:
+    def _next(self, found: MeasuredRate, before: MeasuredRate | None) -> Decision | None:
         count, fewer = self.target, max((k for k in self.measured if k < self.target), default=0)
         middle = (fewer + count) // 2
         is_new = before is not None and middle > fewer and middle not in self.measured
@@ -154,11 +154,11 @@ class Density:
         gain = self.measured[count].per_s / self.measured[1].per_s
         return f"{count} at once make {gain:.2f} times the rate of one"
 
-    def _smaller(self) -> Measured | None:
+    def _smaller(self) -> MeasuredRate | None:
         fewer = [k for k in self.measured if k < self.target]
         return self.measured[max(fewer)] if fewer else None
 
-    def _is_unclear(self, found: Measured, before: Measured, now_s: float) -> bool:
+    def _is_unclear(self, found: MeasuredRate, before: MeasuredRate, now_s: float) -> bool:
         """Whether a longer window may decide otherwise."""
         assert self._window is not None
         limit = (1 + GAIN) * before.per_s
@@ -178,22 +178,22 @@ class Density:
         return decision if count != before or not was_settled else None
 
 
-class _Window:
+class _RateWindow:
     """Rates of the same jobs over some time: of each between two of its reports."""
 
-    def __init__(self, now_s: float, jobs: Mapping[int, Seen]) -> None:
+    def __init__(self, now_s: float, jobs: Mapping[int, JobProgress]) -> None:
         self.started_s = now_s
         self.jobs = set(jobs)
         self._latest = dict(jobs)
         self._points: dict[int, list[tuple[float, float]]] = {number: [] for number in jobs}
 
-    def goes_on(self, jobs: Mapping[int, Seen]) -> bool:
+    def goes_on(self, jobs: Mapping[int, JobProgress]) -> bool:
         """Whether they are the same jobs, and none was started again."""
         return self.jobs == set(jobs) and all(
             seen.reports >= self._latest[number].reports for number, seen in jobs.items()
         )
 
-    def look(self, now_s: float, jobs: Mapping[int, Seen]) -> Measured | None:
+    def look(self, now_s: float, jobs: Mapping[int, JobProgress]) -> MeasuredRate | None:
         """The sum of rates; None: not enough was seen."""
         for number, seen in jobs.items():
             if seen.reports > self._latest[number].reports:
@@ -207,10 +207,10 @@ class _Window:
             for points in self._points.values()
         ]
         variance = sum((_rate(first) - _rate(last)) ** 2 / 4 for first, last in halves)
-        return Measured(sum(map(_rate, self._points.values())), variance**0.5)
+        return MeasuredRate(sum(map(_rate, self._points.values())), variance**0.5)
 
 
-def _gains(found: Measured, before: Measured) -> bool:
+def _gains(found: MeasuredRate, before: MeasuredRate) -> bool:
     return found.per_s >= (1 + GAIN) * before.per_s
 
 

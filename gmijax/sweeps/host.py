@@ -18,13 +18,13 @@ from gmijax.runs.folder import RunPaths
 from gmijax.runs.held import try_lock
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.backends.backend import Backend
-from gmijax.sweeps.children import Child, Process, Seen
+from gmijax.sweeps.children import Child, ChildStatus, Process
 from gmijax.sweeps.slots import Slot
 
 Order = Literal["ask_to_stop", "kill", "close"]
 
 
-class Start(NamedTuple):
+class ChildStart(NamedTuple):
     """What is to be started where; see `Process`."""
 
     slot: Slot
@@ -71,7 +71,7 @@ class LocalHost:
         """
         self._backend = self._entered.enter_context(open_backend(plan, self.machine, run))
 
-    def start(self, start: Start) -> int:
+    def start(self, start: ChildStart) -> int:
         """Starts jobs; the number of their process on this machine, new for each start.
 
         Raises:
@@ -91,11 +91,11 @@ class LocalHost:
             self._clients[self._num_started] = start.slot.allocations[0].gmi
         return self._num_started
 
-    def look(self, child: int) -> Seen | None:
+    def look(self, child: int) -> ChildStatus | None:
         """The newest that is known of a child, None before anything is."""
         return self._children[child].look()
 
-    def look_at_all(self) -> dict[int, Seen]:
+    def look_at_all(self) -> dict[int, ChildStatus]:
         """How all children are that are not closed."""
         return {number: child.look() for number, child in self._children.items()}
 

@@ -169,7 +169,7 @@ def _profile(
         # Only those that have the same number of steps may be one program.
         jobs = [_copy(job, seed, _FOREVER + seed // together) for seed in range(count)]
         inner = StopSignals()
-        window = _Window(jobs, limit_s)
+        window = _CurveWindow(jobs, limit_s)
 
         def tick() -> None:
             # Once: a second signal would end the jobs before they say how much memory they took.
@@ -215,7 +215,7 @@ def _copy(job: Job, seed: int, num_timesteps: int) -> Job:
     return Job(seed, {}, config)
 
 
-class _Window:
+class _CurveWindow:
     """Steps of jobs while all of them train.
 
     Attributes:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 from gmijax.runs.folder import RunPaths
 from gmijax.sweeps.children import Process
 from gmijax.sweeps.progress import Progress
-from gmijax.sweeps.running import J, Outcome, Running
+from gmijax.sweeps.running import J, JobOutcome, Running
 from gmijax.sweeps.slots import Slot
 
 
@@ -60,7 +60,7 @@ class Reader(Protocol):
         ...
 
 
-class Start(NamedTuple):
+class JobStart(NamedTuple):
     """What starts jobs.
 
     Attributes:
@@ -82,7 +82,7 @@ class Kind(Protocol[J]):
         """The job, and those in the queue that may run in one process with it."""
         ...
 
-    def start(self, jobs: tuple[J, ...], slot: Slot) -> Start:
+    def start(self, jobs: tuple[J, ...], slot: Slot) -> JobStart:
         """What runs them there."""
         ...
 
@@ -90,7 +90,7 @@ class Kind(Protocol[J]):
         """Why a process is to be ended that does nothing; None: it does."""
         ...
 
-    def outcome(self, running: Running[J], job: J) -> Outcome:
+    def outcome(self, running: Running[J], job: J) -> JobOutcome:
         """How one of the jobs of a process has ended."""
         ...
 

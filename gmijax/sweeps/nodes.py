@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 from gmijax.cluster.checks import by_name, require_alike, require_shared
 from gmijax.cluster.node import Node
-from gmijax.cluster.ray_nodes import Joined, RayCluster
+from gmijax.cluster.ray_nodes import NodeHandle, RayCluster
 from gmijax.config import ClusterConfig
 from gmijax.config.sweep import JobsConfig
 from gmijax.errors import ConfigError, GmijaxError, NodeLost
@@ -17,8 +17,8 @@ from gmijax.machine.nvidia import GpuLoad
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
-from gmijax.sweeps.children import Seen
-from gmijax.sweeps.host import LocalHost, Order, Start
+from gmijax.sweeps.children import ChildStatus
+from gmijax.sweeps.host import ChildStart, LocalHost, Order
 
 
 class SweepNode(Node):
@@ -37,7 +37,7 @@ class SweepNode(Node):
         except GmijaxError as error:
             return error
 
-    def poll(self) -> dict[int, Seen]:
+    def poll(self) -> dict[int, ChildStatus]:
         """How every child is; for `RemoteNode.look`."""
         return self._host.look_at_all()
 
@@ -56,7 +56,7 @@ class RemoteHost:
     Those that need an answer raise `NodeLost` if it is gone.
     """
 
-    def __init__(self, joined: Joined, name: str) -> None:
+    def __init__(self, joined: NodeHandle, name: str) -> None:
         self.name: str | None = name
         self.machine = joined.facts.machine
         self._node = joined.remote
@@ -76,11 +76,11 @@ class RemoteHost:
         self._run = run
         self._do("open", plan, run)
 
-    def start(self, start: Start) -> int:
+    def start(self, start: ChildStart) -> int:
         """See `LocalHost`."""
         return self._do("start", start)
 
-    def look(self, child: int) -> Seen | None:
+    def look(self, child: int) -> ChildStatus | None:
         """See `LocalHost`."""
         return self._node.look(child)
 

@@ -20,7 +20,7 @@ _LAST_PART = 0.1
 """Of the steps so far: what has no window is averaged over them."""
 
 
-class Found(NamedTuple):
+class ObjectiveValue(NamedTuple):
     """The objective in a line of metrics.
 
     Attributes:
@@ -34,7 +34,7 @@ class Found(NamedTuple):
     episodes: int | None = None
 
 
-def find(line: Mapping[str, Any], objective: str) -> Found | None:
+def find(line: Mapping[str, Any], objective: str) -> ObjectiveValue | None:
     """The objective in a line of metrics; None if it has none, or no finite one.
 
     Means over episodes are those of the long window (`EpisodeWindow`).
@@ -42,11 +42,11 @@ def find(line: Mapping[str, Any], objective: str) -> Found | None:
     episodes = number_in(line, "window/episodes")
     count = None if episodes is None else int(episodes)
     if (long := number_in(line, f"window/{objective}")) is not None:
-        return Found(long, bool(line.get("window/full")), count)
+        return ObjectiveValue(long, bool(line.get("window/full")), count)
     if (number := number_in(line, objective)) is None:
         return None
     # Of a run of an older version, whose lines do not say over what they are means.
-    return Found(number, is_full=not objective.startswith(_OF_EPISODES))
+    return ObjectiveValue(number, is_full=not objective.startswith(_OF_EPISODES))
 
 
 def value_of(curve: Sequence[tuple[int, float]], ranking: Ranking) -> float:

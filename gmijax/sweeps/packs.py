@@ -16,7 +16,7 @@ from gmijax.sweeps.jobs import Job, started_in, state_of
 from gmijax.sweeps.paths import SweepPaths
 
 
-class Packer:
+class PackPlanner:
     """Finds jobs that are trained together.
 
     Args:

@@ -18,7 +18,7 @@ from rich.table import Table
 from gmijax.config.sweep import Ranking
 from gmijax.runs.folder import write_bytes, write_json, write_text
 from gmijax.runs.held import OpenFolder
-from gmijax.sweeps.by_setting import Middle, Row, grouped, middle_of, place_of, settings_of
+from gmijax.sweeps.by_setting import Row, SeedSummary, grouped, place_of, seed_summary, settings_of
 from gmijax.sweeps.kind import AnyJob, label_of, trainings_per_hour
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.progress import State
@@ -34,7 +34,7 @@ _OF_SETTING = ("n", "interquartile_mean", "low", "high", "window_full")
 _ROOM_BYTES = 1 << 16
 
 
-class Report:
+class JobsReport:
     """The files of a sweep, true also where it is killed or the disk gets full.
 
     Args:
@@ -241,12 +241,14 @@ def draw_curves(jobs: Sequence[AnyJob], ranking: Ranking, paths: SweepPaths) -> 
     write_bytes(paths.curves, drawn_png.getvalue())
 
 
-def spread(curves: Sequence[Sequence[tuple[int, float]]]) -> tuple[np.ndarray, Middle]:
+def spread(curves: Sequence[Sequence[tuple[int, float]]]) -> tuple[np.ndarray, SeedSummary]:
     """Steps [P], and the middle of curves there, [P], where all curves are."""
     first = max(curve[0][0] for curve in curves)
     last = min(curve[-1][0] for curve in curves)
     steps = np.linspace(first, max(first, last), CURVE_POINTS)
-    return steps, middle_of(np.stack([np.interp(steps, *np.array(curve).T) for curve in curves]))
+    return steps, seed_summary(
+        np.stack([np.interp(steps, *np.array(curve).T) for curve in curves])
+    )
 
 
 def _row(job: AnyJob, paths: SweepPaths, first_s: float) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.kind import J
 from gmijax.sweeps.nodes import Host, nodes_of
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.report import Report
+from gmijax.sweeps.report import JobsReport
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.slots import Site, SlotPool
 from gmijax.sweeps.study import OptunaStudy, Study, optuna_package
@@ -88,7 +88,7 @@ def _run(
     """Runs the jobs in a folder that is locked, on machines where nothing is started yet."""
     with errors_of_files(paths):
         jobs, study = _beginning(work, paths)
-        report = Report(jobs, work.ranking, work.described, paths, folder, started_s)
+        report = JobsReport(jobs, work.ranking, work.described, paths, folder, started_s)
         report.begin()
     console.print(f"{work.name} folder: {nearby(paths.root)}")
     view = SweepView(console, jobs, work.ranking)
@@ -127,7 +127,7 @@ def _train(
     paths: SweepPaths,
     console: Console,
     study: Study[J],
-    report: Report,
+    report: JobsReport,
     view: SweepView,
     jobs: list[J],
     told: JobEvents,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 from gmijax.clock import running_s
-from gmijax.sweeps.children import Seen
+from gmijax.sweeps.children import ChildStatus
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.slots import Slot
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 J = TypeVar("J", bound="AnyJob")
 
 
-class Outcome(NamedTuple):
+class JobOutcome(NamedTuple):
     """How a job has ended; completed if neither of the first two is so.
 
     Attributes:
@@ -75,7 +75,7 @@ class Running(Generic[J]):
         """Whether it was asked to end."""
         return self.kill_at_s is not None
 
-    def look(self) -> Seen | None:
+    def look(self) -> ChildStatus | None:
         """How it is; None: that is not known."""
         return self.host.look(self.child)
 

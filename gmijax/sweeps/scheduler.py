@@ -14,12 +14,12 @@ from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.folder import add_event
 from gmijax.runs.held import is_locked
 from gmijax.supervise.run_gmis import StopSignals
-from gmijax.sweeps.children import Seen
-from gmijax.sweeps.host import Start
+from gmijax.sweeps.children import ChildStatus
+from gmijax.sweeps.host import ChildStart
 from gmijax.sweeps.kind import J, Kind, Limiter
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.running import Outcome, Running
+from gmijax.sweeps.running import JobOutcome, Running
 from gmijax.sweeps.slots import Slot, SlotPool
 from gmijax.sweeps.study import Study
 
@@ -152,7 +152,7 @@ class Scheduler(Generic[J]):
         start = self._kind.start(jobs, slot)
         for job in jobs:
             job.progress.read(self._paths.job(job.number), self._ranking)
-        child = host.start(Start(slot, start.process))
+        child = host.start(ChildStart(slot, start.process))
         if start.is_awaited:
             self._awaited.setdefault((slot.site, first.program), first.number)
         self._running[first.number] = Running(jobs, slot, host, child, start.readers)
@@ -193,7 +193,7 @@ class Scheduler(Generic[J]):
     def _finish(self, running: Running[J]) -> None:
         del self._running[running.jobs[0].number]
         ends = [self._kind.outcome(running, job) for job in running.jobs]
-        exit_code = (running.look() or Seen(None)).exit_code
+        exit_code = (running.look() or ChildStatus(None)).exit_code
         running.host.order(running.child, "close")
         self._slots.release(running.slot)
         self._nobody_waits_for(running)
@@ -207,7 +207,7 @@ class Scheduler(Generic[J]):
         rest = [job for job in again if job.number in self._alone]
         self._queue = [*first, *self._queue, *rest]
 
-    def _end(self, running: Running[J], job: J, end: Outcome, exit_code: int | None) -> bool:
+    def _end(self, running: Running[J], job: J, end: JobOutcome, exit_code: int | None) -> bool:
         """Notes how a job has ended; whether it is to run again."""
         run, progress = self._paths.job(job.number), job.progress
         progress.read(run, self._ranking)
@@ -242,7 +242,7 @@ class Scheduler(Generic[J]):
         except OSError as error:
             self._unwritten = self._unwritten or error
 
-    def _why_again(self, running: Running[J], job: J, end: Outcome) -> str | None:
+    def _why_again(self, running: Running[J], job: J, end: JobOutcome) -> str | None:
         """Why a job that failed runs once more, if that may help."""
         error, is_shared = end.error or "", not running.slot.is_alone
         if end.is_out_of_memory and self._limiter and self._limiter.forbid(running, error):

@@ -12,13 +12,13 @@ from gmijax.machine.interpreter import command
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.history import MetricsReader
 from gmijax.supervise.failures import may_be_anothers, signal_name
-from gmijax.sweeps.children import Process, Seen
+from gmijax.sweeps.children import ChildStatus, Process
 from gmijax.sweeps.hparams import write_hparams
 from gmijax.sweeps.jobs import Job, placed
-from gmijax.sweeps.kind import Start
-from gmijax.sweeps.packs import Packer, own_end
+from gmijax.sweeps.kind import JobStart
+from gmijax.sweeps.packs import PackPlanner, own_end
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.running import Outcome, Running
+from gmijax.sweeps.running import JobOutcome, Running
 from gmijax.sweeps.slots import Slot
 
 MODULE: Final = "gmijax.workers.training_job"
@@ -40,13 +40,13 @@ class TrainingKind:
 
     def __init__(self, settings: SweepConfig, paths: SweepPaths) -> None:
         self._settings, self._paths = settings, paths
-        self._packer = Packer(settings, paths)
+        self._packer = PackPlanner(settings, paths)
 
     def together(self, job: Job, queue: Sequence[Job], alone: Collection[int]) -> tuple[Job, ...]:
         """See `Kind`."""
         return self._packer.together(job, queue, alone)
 
-    def start(self, jobs: tuple[Job, ...], slot: Slot) -> Start:
+    def start(self, jobs: tuple[Job, ...], slot: Slot) -> JobStart:
         """See `Kind`."""
         # Alone on a GPU a job does as it would without a sweep.
         backend = "auto" if slot.is_whole_gpu else slot.backend
@@ -65,29 +65,29 @@ class TrainingKind:
         readers = tuple(MetricsReader(run.metrics) for run in runs)
         for reader in readers:
             reader.new()  # Those are an earlier attempt's.
-        return Start(process, readers)
+        return JobStart(process, readers)
 
     def why_hung(self, running: Running[Job]) -> str | None:
         """See `Kind`; a controller sees for itself whether its GMIs hang."""
         del running
         return None
 
-    def outcome(self, running: Running[Job], job: Job) -> Outcome:
+    def outcome(self, running: Running[Job], job: Job) -> JobOutcome:
         """See `Kind`."""
         self._packer.forget(job)
-        seen, are_several = running.look() or Seen(None), len(running.jobs) > 1
+        seen, are_several = running.look() or ChildStatus(None), len(running.jobs) > 1
         own = own_end(job, self._paths.job(job.number)) if are_several else None
         if own is not None:
-            return self._failed(running, job, own.error) if own.error else Outcome()
+            return self._failed(running, job, own.error) if own.error else JobOutcome()
         if seen.exit_code == 0 and not are_several:
-            return Outcome()
+            return JobOutcome()
         was_asked = seen.exit_code == EXIT_INTERRUPTED and running.is_asked
         if running.is_killed or was_asked or (running.was_killed and running.is_asked):
-            return Outcome(is_interrupted=True)
+            return JobOutcome(is_interrupted=True)
         if seen.exit_code is None:
-            return Outcome(error=running.host.lost, is_fault=True)
+            return JobOutcome(error=running.host.lost, is_fault=True)
         if seen.exit_code == EXIT_INTERRUPTED:
-            return Outcome(error="a signal from elsewhere interrupted it", is_fault=True)
+            return JobOutcome(error="a signal from elsewhere interrupted it", is_fault=True)
         if seen.exit_code < 0:
             killed_by = signal_name(-seen.exit_code)
             error = f"its controller was killed by {killed_by}"
@@ -98,10 +98,10 @@ class TrainingKind:
 
     def _failed(
         self, running: Running[Job], job: Job, error: str, *, is_fault: bool = False
-    ) -> Outcome:
+    ) -> JobOutcome:
         others = running.slot.backend in _ENDED_BY_GPU and may_be_anothers(error)
         again = others and self.max_restarts(job) > 0
-        return Outcome(error=error, is_fault=is_fault, may_be_anothers=again)
+        return JobOutcome(error=error, is_fault=is_fault, may_be_anothers=again)
 
     def max_restarts(self, job: Job) -> int:
         """See `Kind`."""

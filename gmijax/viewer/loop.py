@@ -206,14 +206,14 @@ class Loop:
 
     def _do_in_simulation(
         self,
-        request: requests.Step
+        request: requests.StepRequest
         | requests.Reset
         | requests.Push
         | requests.Drag
         | requests.SetCommand,
     ) -> None:
         match request:
-            case requests.Step():
+            case requests.StepRequest():
                 self._pause(True)
                 self._simulation.step()
             case requests.Reset():

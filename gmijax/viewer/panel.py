@@ -93,7 +93,7 @@ class Panel:
         acts: dict[str, Callable[[], requests.Request]] = {
             _RUN: lambda: requests.Pause(False),
             _PAUSE: lambda: requests.Pause(True),
-            _STEP: requests.Step,
+            _STEP: requests.StepRequest,
             _RESET: requests.Reset,
         }
 

@@ -21,7 +21,7 @@ class Pause(NamedTuple):
     paused: bool
 
 
-class Step(NamedTuple):
+class StepRequest(NamedTuple):
     """Pause, and take one control step."""
 
 
@@ -93,7 +93,7 @@ class Wake(NamedTuple):
 
 Request: TypeAlias = (
     Pause
-    | Step
+    | StepRequest
     | Reset
     | SetSpeed
     | Push

@@ -32,7 +32,7 @@ def _run(link: ChildLink) -> None:
     import jax
 
     from gmijax.learning.algorithm import saved_state
-    from gmijax.learning.episodes import Options, run_episodes
+    from gmijax.learning.episodes import EpisodeOptions, run_episodes
     from gmijax.learning.learner import make_learner
     from gmijax.sim.camera import check_camera, choose_camera
     from gmijax.sim.randomize import make_worlds
@@ -50,7 +50,7 @@ def _run(link: ChildLink) -> None:
         env,
         learner,
         state,
-        Options(
+        EpisodeOptions(
             num_envs=config.num_envs,
             num_shown=min(config.num_envs, max(config.num_filmed, MOST_RECORDED)),
             seed=config.seed,

@@ -45,7 +45,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
     # jax starts here, in the environment that the plan prepared.
     import numpy as np
 
-    from gmijax.collection.collectors import Share
+    from gmijax.collection.collectors import CollectorContext
     from gmijax.devices import describe_device
     from gmijax.learning.start import worlds_of
     from gmijax.selfcheck import check_share
@@ -62,12 +62,12 @@ def _run(link: ChildLink) -> dict[str, Any]:
         if own == SIMULATOR and config.output.dir is not None:
             writer = _writer(config, rank, first, policy)
             held.callback(writer.close)
-        share = Share(
+        context = CollectorContext(
             *(config, link, env, policy, rank, first, num_unrolls, writer),
             barrier=lambda: comm.all_gather(np.zeros(1, np.float32)),
         )
         # The template says where what this GMI does is written.
-        result = import_module(_TEMPLATES[plan.template]).collect(share, plan)
+        result = import_module(_TEMPLATES[plan.template]).collect(context, plan)
     written = {} if writer is None else {"shards": writer.num_written, "bytes": writer.num_bytes}
     return {
         **{"roles": roles, "policy_digest": policy.digest, "device": describe_device()},

@@ -13,7 +13,7 @@ from toy_env import point_mass
 from training_jobs import wait_until
 
 from gmijax.a3c.agent import Agent
-from gmijax.a3c.job_registers import JobRegisters, Orders, Report, open_job_registers
+from gmijax.a3c.job_registers import AgentCommand, AgentReport, JobRegisters, open_job_registers
 from gmijax.a3c.rollout import num_counts
 from gmijax.channels.registers import create_registers
 from gmijax.cli.compose import compose
@@ -73,7 +73,7 @@ class _Publisher(_NoRoom):
         if len(self.taken) == 1:
             self._registers.weights.publish(self._packed, tag=4)
         if len(self.taken) == 3:
-            self._registers.orders.publish(Orders(None, is_ending=True).pack())
+            self._registers.orders.publish(AgentCommand(None, is_ending=True).pack())
         return True
 
 
@@ -87,7 +87,7 @@ def _agent(tmp_path, config):
     learner = make_learner(ENV.spec, config.algo)
     weights = acting_weights(learner, init_learner(learner, ENV.spec.obs_size, jax.random.key(0)))
     registers.weights.publish(np.asarray(pack_weights(weights)), tag=3)
-    registers.orders.publish(Orders(None, is_ending=False).pack())
+    registers.orders.publish(AgentCommand(None, is_ending=False).pack())
     return registers, link, weights, learner
 
 
@@ -124,17 +124,17 @@ def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path) -> None:
 
     def added(steps: int) -> bool:
         snapshot = registers.reports[0].read()
-        return snapshot is not None and Report.unpack(snapshot.values).checkpoint == steps
+        return snapshot is not None and AgentReport.unpack(snapshot.values).checkpoint == steps
 
     agent = Agent(config, ENV, 0, (0,), registers, sender, link)
     with ThreadPoolExecutor(1) as pool:
         outcome = pool.submit(agent.run)
         try:
             assert sender.was_asked.wait(timeout=60)
-            registers.orders.publish(Orders(5, is_ending=False).pack())
+            registers.orders.publish(AgentCommand(5, is_ending=False).pack())
             wait_until(lambda: added(5), 60, "environments in the checkpoint")
         finally:
-            registers.orders.publish(Orders(9, is_ending=True).pack())
+            registers.orders.publish(AgentCommand(9, is_ending=True).pack())
         told = outcome.result(timeout=120)
     assert told["unrolls"] == 0
     assert 0 < told["wait_s"] <= sender.waited_s

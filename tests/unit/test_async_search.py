@@ -14,7 +14,7 @@ from rich.console import Console
 from supervision import gpu, machine
 
 from gmijax.autotune import tuner
-from gmijax.autotune.async_profile import FEWEST_LINES, Enough, measured_of, window_start
+from gmijax.autotune.async_profile import FEWEST_LINES, ProfileWindow, measured_of, window_start
 from gmijax.autotune.async_workload import A3cWorkload, balance, per_gpu, throughput
 from gmijax.autotune.grid import Measured, Point
 from gmijax.autotune.tuner import with_auto_decided
@@ -112,7 +112,7 @@ def test_a_profile_is_read_when_channels_had_filled(tmp_path: Path):
     config = wanted()
     run = RunPaths(tmp_path)
     plan = training_plan(compose("algo=a3c", "plan.serving_gmis_per_gpu=2"), machine(0))
-    is_enough = Enough(config, plan, run)
+    is_enough = ProfileWindow(config, plan, run)
     told: list[str] = []
 
     def with_lines(number: int) -> None:

@@ -13,14 +13,14 @@ from training_jobs import wait_until
 from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.learning import checkpoint_saver
 from gmijax.learning.checkpoint import restore_envs
-from gmijax.learning.checkpoint_saver import CheckpointSaver, Part
+from gmijax.learning.checkpoint_saver import CheckpointPart, CheckpointSaver
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
 
 
-def part(folder: Path, env_steps: int, envs: Any = None) -> Part:
+def part(folder: Path, env_steps: int, envs: Any = None) -> CheckpointPart:
     meta = CheckpointMeta("ant", "ppo", env_steps, 1, 8, ((8,), (8,)), "jax")
-    return Part(RunPaths(folder), meta, {"w": np.ones(2)}, envs)
+    return CheckpointPart(RunPaths(folder), meta, {"w": np.ones(2)}, envs)
 
 
 @pytest.fixture

@@ -229,7 +229,7 @@ def test_a_profile_is_not_late(stop: Stop) -> None:
 
 
 def test_jobs_of_a_sweep_are_not_late(stop: Stop, monkeypatch: pytest.MonkeyPatch) -> None:
-    window = jobs_per_gpu._Window([], LIMIT_S)
+    window = jobs_per_gpu._CurveWindow([], LIMIT_S)
     job: Any = SimpleNamespace(progress=SimpleNamespace(env_steps=0, state="running"))
     window._jobs = [job]
     window._seen = [{0}]

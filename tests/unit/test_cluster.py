@@ -22,15 +22,15 @@ from gmijax.cluster.cluster_job import BackendOfNodes, ClusterJob
 from gmijax.cluster.node import (
     Facts,
     Node,
-    Opened,
-    Seen,
+    NodeEndpoints,
+    RemoteGmiStatus,
     TrainingNode,
     address_of,
     own_versions,
 )
-from gmijax.cluster.ray_nodes import Joined, RayCluster
+from gmijax.cluster.ray_nodes import NodeHandle, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
-from gmijax.cluster.survey import Surveyed, differences, lines_of_nodes, nodes_as_data
+from gmijax.cluster.survey import NodeInfo, differences, lines_of_nodes, nodes_as_data
 from gmijax.collectives.nodes.rendezvous import NodeAddresses
 from gmijax.config import ClusterConfig, PlanConfig, ReduceConfig
 from gmijax.errors import (
@@ -71,8 +71,8 @@ def a_node(**answers: Any) -> RemoteNode:
     return RemoteNode(ask, 1, "10.0.0.2")
 
 
-def joined(node: RemoteNode, versions: dict[str, str | None] | None = None) -> list[Joined]:
-    return [Joined(node, Facts(node.address, machine(0), versions or own_versions()))]
+def joined(node: RemoteNode, versions: dict[str, str | None] | None = None) -> list[NodeHandle]:
+    return [NodeHandle(node, Facts(node.address, machine(0), versions or own_versions()))]
 
 
 @pytest.mark.parametrize(
@@ -253,20 +253,20 @@ def test_packages_for_gpus_are_compared_between_nodes_that_have_some() -> None:
         Facts(name, machine(1), versions | {"cuda-bindings": bindings})
         for name, bindings in (("a", "13.0"), ("b", "13.1"))
     ]
-    nodes = [Joined(RemoteNode(a_node().call, 0, one.address), one) for one in facts]
+    nodes = [NodeHandle(RemoteNode(a_node().call, 0, one.address), one) for one in facts]
     require_alike(nodes[:1])
     with pytest.raises(ConfigError, match=r"differ in cuda-bindings: 13\.0 on a; 13\.1 on b;"):
         require_alike(nodes)
-    without = [Joined(one.remote, one.facts._replace(machine=machine(0))) for one in nodes]
+    without = [NodeHandle(one.remote, one.facts._replace(machine=machine(0))) for one in nodes]
     require_alike(without)
 
 
 def test_the_doctor_says_in_what_nodes_differ() -> None:
     own = own_versions()
     nodes = {
-        "a": Surveyed(Facts("a", machine(2), own), 0.01),
-        "b": Surveyed(Facts("b", machine(1), {**own, "jax": "0.1", "cuda-bindings": "13"}), -90.0),
-        "c": Surveyed(Facts("c", machine(0), own), 0.0),
+        "a": NodeInfo(Facts("a", machine(2), own), 0.01),
+        "b": NodeInfo(Facts("b", machine(1), {**own, "jax": "0.1", "cuda-bindings": "13"}), -90.0),
+        "c": NodeInfo(Facts("c", machine(0), own), 0.0),
     }
     problems, notes = differences(nodes)
     assert problems == [
@@ -320,7 +320,7 @@ def test_who_waited_in_vain_comes_before_who_lost_that_one() -> None:
 
 
 def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
-    seen = {2: Seen(None, 1, Heartbeat("running", 7, 99), None, 0)}
+    seen = {2: RemoteGmiStatus(None, 1, Heartbeat("running", 7, 99), None, 0)}
     answers: dict[str, Any] = {"start": 99, "poll": seen}
     node = a_node()
     node._ask = lambda method, *_: FakeAnswer(answers[method])
@@ -368,14 +368,14 @@ def test_only_what_ray_says_itself_is_a_lost_node() -> None:
 def test_what_nodes_say_of_backends_is_heard_with_their_address(tmp_path: Path) -> None:
     plan = plan_on(gpus_of_nodes(1, 1), gmis_per_gpu=2)
     launch = make_launch(RunPaths(tmp_path), ["train"] * 4, plan)
-    opened = Opened(("10.0.0.2", 1), {}, {})
+    opened = NodeEndpoints(("10.0.0.2", 1), {}, {})
     told: list[tuple[Any, ...]] = []
 
     class Returned(FakeAnswer):
         def get(self) -> Any:
             return self.value  # An error too, if a node returns one.
 
-    def node(**answers: Any) -> Joined:
+    def node(**answers: Any) -> NodeHandle:
         def ask(method: str, *arguments: Any) -> FakeAnswer:
             told.append((method, *arguments))
             return Returned(answers.get(method))

@@ -18,8 +18,8 @@ import gmijax
 from gmijax.baselines.tdg_steps import infer, next_keys, simulate
 from gmijax.collection.programs import (
     ActingPolicy,
-    Keep,
-    Step,
+    CollectedStep,
+    RecordSpec,
     _trained,
     random_policy,
     unroll,
@@ -36,7 +36,7 @@ from gmijax.sim.wrappers import BatchedEnv, env_keys
 from gmijax.supervise.child import ChildLink
 
 N, T = 6, 30
-ALL = Keep(steps=True, next_obs=True)
+ALL = RecordSpec(steps=True, next_obs=True)
 
 
 class Unrolled(NamedTuple):
@@ -45,7 +45,7 @@ class Unrolled(NamedTuple):
     env: BatchedEnv
     learner: Learner
     policy: ActingPolicy
-    steps: Step
+    steps: CollectedStep
     counts: Counts
 
 
@@ -126,7 +126,7 @@ def test_shards_are_whole_and_say_what_they_are(tmp_path: Path):
         (paths.folder(1) / name).write_bytes(b"left by a job that was killed")
     writer = ShardWriter(paths, 1, 2, {"seed": 5})
     full = partial(np.full, (T, N), dtype=np.float32)
-    step = Step(full(0), full(1), full(2), full(3), full(4), full(5), None)
+    step = CollectedStep(full(0), full(1), full(2), full(3), full(4), full(5), None)
     writer.write(step)
     writer.write(step._replace(reward=full(7)))
     writer.wait()
@@ -137,7 +137,7 @@ def test_shards_are_whole_and_say_what_they_are(tmp_path: Path):
         *("000002.json", "000002.npz", "000003.json", "000003.npz"),
     ]
     with np.load(paths.shard(1, 3).arrays) as arrays:
-        assert set(arrays) == set(Step._fields) - {"next_obs"}
+        assert set(arrays) == set(CollectedStep._fields) - {"next_obs"}
         assert (arrays["reward"] == 7).all()
     about = [json.loads(paths.shard(1, index).about.read_text()) for index in (2, 3)]
     assert [item["starts_with_reset"] for item in about] == [True, False]

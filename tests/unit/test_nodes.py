@@ -25,7 +25,7 @@ from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.nodes.rendezvous import NodeAddresses, connect, listen
-from gmijax.collectives.strategies import COSTS, Stage, nodes_s, predicted_s, stages
+from gmijax.collectives.strategies import COSTS, ReductionStage, nodes_s, predicted_s, stages
 from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PeerLost
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import select_strategy, why_not_strategy
@@ -217,16 +217,16 @@ def test_a_layout_on_nodes_has_global_ids_and_ranks_in_nodes() -> None:
 
 def test_the_stages_of_nodes_are_those_of_har_on_as_many_gpus() -> None:
     assert stages("mpr", Layout.even(1, 2).on_nodes(2)) == [
-        Stage("all_reduce", "host", ((0, 1), (2, 3))),
-        Stage("all_reduce", "nodes", ((0, 1), (2, 3))),
+        ReductionStage("all_reduce", "host", ((0, 1), (2, 3))),
+        ReductionStage("all_reduce", "nodes", ((0, 1), (2, 3))),
     ]
     assert stages("mpr", Layout.even(1, 1).on_nodes(3)) == [
-        Stage("all_reduce", "nodes", ((0,), (1,), (2,)))
+        ReductionStage("all_reduce", "nodes", ((0,), (1,), (2,)))
     ]
     assert stages("har", Layout.even(2, 1).on_nodes(2), "ipc") == [
-        Stage("all_gather", "ipc", ((0,), (1,), (2,), (3,))),
-        Stage("all_gather", "ring", ((0, 1), (2, 3))),
-        Stage("all_reduce", "nodes", ((0, 1), (2, 3))),
+        ReductionStage("all_gather", "ipc", ((0,), (1,), (2,), (3,))),
+        ReductionStage("all_gather", "ring", ((0, 1), (2, 3))),
+        ReductionStage("all_reduce", "nodes", ((0, 1), (2, 3))),
     ]
     assert why_not_strategy("har", Layout.even(1, 2).on_nodes(2)) is None
     assert "in each node its rings go" in str(
@@ -238,10 +238,10 @@ def test_the_stages_of_nodes_are_those_of_har_on_as_many_gpus() -> None:
 def test_only_leaders_copy_their_numbers_from_the_gpu_for_the_sum_of_nodes(
     rank: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node = Stage("all_reduce", "nodes", ((0, 1), (2, 3)))
-    back = Stage("broadcast", "host", ((1, 0), (2,)))
+    node = ReductionStage("all_reduce", "nodes", ((0, 1), (2, 3)))
+    back = ReductionStage("broadcast", "host", ((1, 0), (2,)))
     assert [node.reads(rank), back.reads(rank)] == [rank in (0, 2), rank != 0]
-    assert Stage("all_reduce", "host", ((0, 1, 2, 3),)).reads(rank)
+    assert ReductionStage("all_reduce", "host", ((0, 1, 2, 3),)).reads(rank)
 
     did: list[str] = []
     queue: Any = ModuleType("cuda_queue")

@@ -19,16 +19,16 @@ from gmijax.control.console import open_console
 from gmijax.errors import ConfigError
 from gmijax.machine.mps_control import MEMORY_LIMIT_VARIABLE, PIPE_VARIABLE
 from gmijax.machine.nvidia import GpuLoad
-from gmijax.packs import crowd as crowds
+from gmijax.packs import slot_limiter
 from gmijax.packs.command_job import CommandJob
 from gmijax.packs.command_kind import CommandKind, PackPaths
-from gmijax.packs.crowd import Crowd
 from gmijax.packs.failure import failure_of
 from gmijax.packs.pack import PackWork
+from gmijax.packs.slot_limiter import SlotLimiter
 from gmijax.supervise.backends.backend import Backend
-from gmijax.sweeps.children import Process, Seen
+from gmijax.sweeps.children import ChildStatus, Process
 from gmijax.sweeps.host import LocalHost, client_variables
-from gmijax.sweeps.running import Outcome, Running
+from gmijax.sweeps.running import JobOutcome, Running
 from gmijax.sweeps.slots import Slot, SlotPool
 from gmijax.sweeps.work import Folder
 
@@ -235,9 +235,9 @@ class Ended(LocalHost):
     def __init__(self) -> None:
         super().__init__(GPU)
 
-    def look(self, child: int) -> Seen:
+    def look(self, child: int) -> ChildStatus:
         del child
-        return Seen(1)
+        return ChildStatus(1)
 
 
 def test_of_jobs_that_a_gpu_fault_ended_the_first_runs_alone(kind: CommandKind) -> None:
@@ -245,7 +245,7 @@ def test_of_jobs_that_a_gpu_fault_ended_the_first_runs_alone(kind: CommandKind) 
     host = Ended()
     slots = SlotPool(work.sites([host]))
 
-    def fail(job: CommandJob) -> Outcome:
+    def fail(job: CommandJob) -> JobOutcome:
         slot = slots.acquire(1)
         assert slot is not None
         log = kind.start((job,), slot).process.log
@@ -325,7 +325,7 @@ class Packed:
         self.host = Gpu()
         sites = work.sites([self.host])
         self.slots = SlotPool(sites)
-        self.crowd = Crowd(self.slots, sites, [self.host], open_console(show=False))
+        self.limiter = SlotLimiter(self.slots, sites, [self.host], open_console(show=False))
         self.queue = list(work.jobs)
         self.running: list[Running[CommandJob]] = []
 
@@ -341,7 +341,7 @@ class Packed:
             for one in self.running:
                 one.jobs[0].progress.env_steps += round(rate)
                 one.jobs[0].progress.reports += 1 if rate else 0
-            for one in self.crowd.look(self.running):
+            for one in self.limiter.look(self.running):
                 self.running.remove(one)
                 self.slots.release(one.slot)
                 self.queue.insert(0, one.jobs[0])
@@ -350,7 +350,7 @@ class Packed:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(crowds, "running_s", clock)
+    monkeypatch.setattr(slot_limiter, "running_s", clock)
     return clock
 
 
@@ -359,9 +359,9 @@ def test_jobs_are_added_while_they_gain_and_taken_back_when_they_do_not(clock: C
     packed = Packed(clock, curve, memory_mib=100.0)
     packed.go_on(600)
     assert len(packed.running) == 4
-    assert [change["at_once"] for change in packed.crowd.decisions] == [4, 8, 6, 4]
-    assert packed.crowd.decisions[1]["why"] == "4 at once make 3.10 times the rate of one"
-    assert packed.crowd.decisions[-1]["why"] == "6 at once make 0.87 times the rate of 4"
+    assert [change["at_once"] for change in packed.limiter.decisions] == [4, 8, 6, 4]
+    assert packed.limiter.decisions[1]["why"] == "4 at once make 3.10 times the rate of one"
+    assert packed.limiter.decisions[-1]["why"] == "6 at once make 0.87 times the rate of 4"
     newest = max(one.started_s for one in packed.running)
     assert newest < 200.0  # The oldest went on.
 
@@ -369,15 +369,15 @@ def test_jobs_are_added_while_they_gain_and_taken_back_when_they_do_not(clock: C
 def test_jobs_of_another_command_are_measured_anew(clock: Clock) -> None:
     packed = Packed(clock, [1000.0, 1010.0], memory_mib=100.0)
     packed.go_on(400)
-    assert [len(packed.running), packed.crowd.decisions[-1]["at_once"]] == [1, 1]
+    assert [len(packed.running), packed.limiter.decisions[-1]["at_once"]] == [1, 1]
     packed.go_on(400)
-    assert packed.crowd.decisions[-1]["time_s"] < 400.0  # Of the same command: nothing new.
+    assert packed.limiter.decisions[-1]["time_s"] < 400.0  # Of the same command: nothing new.
     packed.queue = [replace(job, command=("other",)) for job in packed.queue]
     packed.rates = [1000.0 * k for k in range(1, 17)]
     done = packed.running.pop()
     packed.slots.release(done.slot)
     packed.go_on(400)
-    assert packed.crowd.decisions[-1]["at_once"] > 4
+    assert packed.limiter.decisions[-1]["at_once"] > 4
 
 
 def test_memory_of_the_first_job_bounds_their_number(clock: Clock) -> None:
@@ -390,7 +390,7 @@ def test_without_a_rate_an_idle_gpu_gets_a_second_job(clock: Clock) -> None:
     packed = Packed(clock, [0.0], memory_mib=100.0)
     packed.go_on(400)
     assert len(packed.running) == 2
-    assert "no rate is found" in packed.crowd.decisions[0]["why"]
+    assert "no rate is found" in packed.limiter.decisions[0]["why"]
     busy = Packed(clock, [0.0], memory_mib=100.0)
     busy.host.busy = 0.9
     busy.go_on(400)
@@ -406,8 +406,8 @@ def test_short_jobs_are_added_without_a_measurement(clock: Clock) -> None:
         packed.slots.release(done.slot)
     packed.go_on(2)
     # The second that completed had begun beside three others; the first had been alone.
-    assert [change["at_once"] for change in packed.crowd.decisions][:2] == [4, 8]
-    assert packed.crowd.decisions[0]["why"] == "jobs end before a rate is measured"
+    assert [change["at_once"] for change in packed.limiter.decisions][:2] == [4, 8]
+    assert packed.limiter.decisions[0]["why"] == "jobs end before a rate is measured"
 
 
 def test_a_job_alone_on_its_gpu_may_have_all_of_it(kind: CommandKind) -> None:
@@ -437,7 +437,7 @@ def test_a_job_that_starts_again_does_not_spoil_the_measurement(clock: Clock) ->
     progress = packed.running[-1].jobs[0].progress
     progress.env_steps = progress.reports = 0
     packed.go_on(200)
-    assert all(rate > 0 for one in packed.crowd.decisions for rate in one["rate_per_s"].values())
+    assert all(rate > 0 for one in packed.limiter.decisions for rate in one["rate_per_s"].values())
     assert len(packed.running) >= 4
 
 
@@ -445,9 +445,9 @@ def test_what_finds_no_memory_runs_again_beside_fewer(clock: Clock) -> None:
     packed = Packed(clock, [1000.0, 1900.0, 2800.0, 3700.0], memory_mib=100.0)
     packed.go_on(40)
     for fewer in (3, 2, 1):
-        assert packed.crowd.forbid(packed.running[1], "exit code 1: out of memory")
-        assert packed.crowd.decisions[-1]["at_once"] == fewer
-    assert not packed.crowd.forbid(packed.running[0], "again")  # Fewer than one cannot run.
+        assert packed.limiter.forbid(packed.running[1], "exit code 1: out of memory")
+        assert packed.limiter.decisions[-1]["at_once"] == fewer
+    assert not packed.limiter.forbid(packed.running[0], "again")  # Fewer than one cannot run.
 
 
 def test_the_report_has_names_of_variables_and_not_their_values() -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import pytest
 
-from gmijax.sweeps.density import Density, Seen
+from gmijax.sweeps.density import Density, JobProgress
 
 SATURATING = {1: 1.0, 2: 1.91, 4: 3.16, 8: 3.84}  # mjlab on an H100.
 PEAKED = {1: 1.0, 2: 1.85, 3: 2.4, 4: 2.8, 6: 2.3, 8: 1.8}  # Cores run out.
@@ -27,7 +27,9 @@ def found_by(density: Density, curve: Mapping[int, float], noise: float = 0.03) 
             job[0] += curve[len(jobs)] / len(jobs) * draw.gauss(1, noise)
             job[1] += 1
         now_s += 1.0
-        seen = {number: Seen(done, int(reports)) for number, (done, reports) in jobs.items()}
+        seen = {
+            number: JobProgress(done, int(reports)) for number, (done, reports) in jobs.items()
+        }
         if (decision := density.look(now_s, seen)) is not None:
             why.append(decision.why)
             for number in sorted(jobs)[decision.target :]:
@@ -63,14 +65,14 @@ def test_a_step_too_far_is_taken_back_and_says_why():
 def test_nothing_is_measured_before_all_are_warm():
     density = Density(8)
     for second in range(100):
-        assert density.look(float(second), {0: Seen(float(second), 2)}) is None
+        assert density.look(float(second), {0: JobProgress(float(second), 2)}) is None
     assert density.measured == {}
 
 
 def test_a_job_that_ends_starts_the_measurement_anew():
     density = Density(8)
     for second in range(100):
-        density.look(float(second), {second // 10: Seen(float(second), 3 + second)})
+        density.look(float(second), {second // 10: JobProgress(float(second), 3 + second)})
     assert density.measured == {}
 
 

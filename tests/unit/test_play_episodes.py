@@ -11,7 +11,7 @@ import pytest
 
 from gmijax.cli.compose import compose
 from gmijax.config import AlgoConfig
-from gmijax.learning.episodes import CHUNK_STEPS, Episodes, Options, run_episodes
+from gmijax.learning.episodes import CHUNK_STEPS, EpisodeOptions, Episodes, run_episodes
 from gmijax.learning.learner import init_learner, make_learner
 from gmijax.sim import episode
 from gmijax.sim.interaction import time_limit
@@ -54,7 +54,7 @@ def algo() -> AlgoConfig:
 def episodes_of(algo: AlgoConfig, env: Env, **changes: object):
     learner = make_learner(SPEC, algo)
     state = init_learner(learner, SPEC.obs_size, jax.random.key(1))
-    options = Options(num_envs=8, num_shown=3, seed=0, deterministic=True, max_steps=None)
+    options = EpisodeOptions(num_envs=8, num_shown=3, seed=0, deterministic=True, max_steps=None)
     chunks: list[int] = []
     played = run_episodes(env, learner, state, options._replace(**changes), chunks.append)
     assert chunks == list(range(-(-int(played.lengths.max()) // CHUNK_STEPS) + 1))

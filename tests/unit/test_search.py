@@ -11,11 +11,11 @@ import pytest
 from benchmarks.records import RESULTS
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point, coarse, neighbours
 from gmijax.autotune.search import (
-    Outcome,
     OutOfBudget,
     Profile,
     Rules,
-    Visited,
+    SearchOutcome,
+    SearchPoint,
     estimate,
     saturation,
     search,
@@ -50,12 +50,12 @@ def gpu(point: Point) -> Measured:
     return measured(min(alone, 2.7e6 / point.gmis_per_gpu), 80.0 + 0.05 * point.num_envs)
 
 
-def best(outcome: Outcome) -> Visited:
+def best(outcome: SearchOutcome) -> SearchPoint:
     assert outcome.best is not None
     return outcome.best
 
 
-def points(outcome: Outcome) -> list[tuple[int, int]]:
+def points(outcome: SearchOutcome) -> list[tuple[int, int]]:
     return [(one.point.gmis_per_gpu, one.point.num_envs) for one in outcome.visited]
 
 

@@ -23,7 +23,7 @@ from gmijax.sweeps import report, scheduler
 from gmijax.sweeps.children import Child, Process
 from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.report import Report
+from gmijax.sweeps.report import JobsReport
 from gmijax.sweeps.study import Study
 
 
@@ -115,7 +115,7 @@ def test_room_is_kept_for_the_end_of_a_sweep(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paths = SweepPaths(tmp_path)
-    files = Report(ended_job(), SweepConfig(), dict, paths, OpenFolder(paths.root, "x"), 0.0)
+    files = JobsReport(ended_job(), SweepConfig(), dict, paths, OpenFolder(paths.root, "x"), 0.0)
     files.begin()
     assert read_json(paths.sweep)["status"] == "running"
     assert paths.room.stat().st_blocks * 512 >= 2 * paths.sweep.stat().st_size

@@ -16,7 +16,7 @@ from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
 from gmijax.cluster import ray_nodes
 from gmijax.cluster.node import Facts, Node
-from gmijax.cluster.ray_nodes import Joined, RayCluster
+from gmijax.cluster.ray_nodes import NodeHandle, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
 from gmijax.config import ClusterConfig
 from gmijax.config.sweep import SweepConfig
@@ -26,12 +26,12 @@ from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.held import OpenFolder
 from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps import jobs_per_gpu, kind, scheduler
-from gmijax.sweeps.children import Seen
-from gmijax.sweeps.host import LocalHost, Order, Start
+from gmijax.sweeps.children import ChildStatus
+from gmijax.sweeps.host import ChildStart, LocalHost, Order
 from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.nodes import RemoteHost, SweepNode, nodes_of, num_cpus_of
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.report import Report
+from gmijax.sweeps.report import JobsReport
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
 from gmijax.sweeps.study import Study
@@ -46,12 +46,12 @@ class FakeHost(LocalHost):
         super().__init__(machine(0))
         self.name = name
         self.running: dict[int, int] = {}  # Jobs by their children.
-        self.seen: dict[int, Seen] = {}
+        self.seen: dict[int, ChildStatus] = {}
         self.started: list[int] = []
         self.folders: list[list[Path]] = []  # Of the jobs of each start.
         self._numbers = itertools.count()
 
-    def start(self, start: Start) -> int:
+    def start(self, start: ChildStart) -> int:
         if self.lost is not None:
             raise NodeLost(self.lost)
         assert start.process.order is not None
@@ -70,12 +70,12 @@ class FakeHost(LocalHost):
         """Names of the jobs of each start."""
         return [[folder.name for folder in folders] for folders in self.folders]
 
-    def look(self, child: int) -> Seen | None:
+    def look(self, child: int) -> ChildStatus | None:
         return self.seen.get(child)
 
     def order(self, child: int, order: Order) -> None:
         if order in ("ask_to_stop", "kill"):
-            self.seen[child] = Seen(130)
+            self.seen[child] = ChildStatus(130)
         if order == "close":
             del self.running[child]
 
@@ -84,7 +84,7 @@ class FakeHost(LocalHost):
         for child in self.running if exit_code == 0 else ():
             for run in self.folders[child]:
                 write_json(RunPaths(run).summary, {"status": "completed", "env_steps": 10**12})
-        self.seen |= {child: Seen(exit_code, "CUDA_ERROR_X") for child in self.running}
+        self.seen |= {child: ChildStatus(exit_code, "CUDA_ERROR_X") for child in self.running}
 
 
 class Sweep:
@@ -186,7 +186,7 @@ def test_jobs_of_a_node_that_is_lost_run_again_on_the_other(tmp_path: Path) -> N
     assert {job.progress.node for job in sweep.jobs} == {"a"}
     events = (sweep.paths.job(1).events).read_text()
     assert "no power" in events
-    report = Report(
+    report = JobsReport(
         sweep.jobs, sweep.settings, dict, sweep.paths, OpenFolder(sweep.paths.root, "x"), 1.0
     )
     assert report.end("completed") is None
@@ -250,7 +250,7 @@ def test_a_profile_of_a_job_with_two_gpus_has_both(
 class AwaitedKind(TrainingKind):
     """Jobs that compile what others of their program find in a cache."""
 
-    def start(self, jobs: tuple[Job, ...], slot: Slot) -> kind.Start:
+    def start(self, jobs: tuple[Job, ...], slot: Slot) -> kind.JobStart:
         return super().start(jobs, slot)._replace(is_awaited=True)
 
 
@@ -372,7 +372,7 @@ def test_what_a_node_refuses_is_raised_here_and_does_not_lose_it() -> None:
             return True
 
     node = RemoteNode(lambda method, *args: Answer(getattr(here, method)(*args)), 1, "10.0.0.2")
-    host = RemoteHost(Joined(node, Facts("10.0.0.2", Machine((), (0,)), {})), "10.0.0.2")
+    host = RemoteHost(NodeHandle(node, Facts("10.0.0.2", Machine((), (0,)), {})), "10.0.0.2")
     plan = plan_slots(SweepConfig(jobs_per_gpu=1), machine(0), {"auto"})
     with pytest.raises(BackendUnavailable, match="no daemon"):
         host.open(plan, RunPaths(Path("nowhere")))

@@ -23,7 +23,7 @@ from gmijax.runs.held import OpenFolder
 from gmijax.sweeps.hparams import write_hparams
 from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.paths import SweepPaths
-from gmijax.sweeps.report import Report
+from gmijax.sweeps.report import JobsReport
 from gmijax.sweeps.view import SweepView
 
 SWEEP = SweepConfig(objective="return")
@@ -203,7 +203,7 @@ def test_throughput_is_of_the_jobs_that_a_command_has_run(tmp_path: Path) -> Non
     jobs[3].progress.state, jobs[3].progress.error = "completed", None  # By an earlier command.
     for job in jobs[:2]:
         job.progress.state, job.progress.ended_s = "completed", jobs[2].progress.ended_s
-    whole = Report(jobs, SWEEP, dict, SweepPaths(tmp_path), OpenFolder(tmp_path, "x"), 0.0)
+    whole = JobsReport(jobs, SWEEP, dict, SweepPaths(tmp_path), OpenFolder(tmp_path, "x"), 0.0)
     assert whole.end("completed") is None
     report = whole.data
     assert report["trainings_per_hour"] == pytest.approx(3 * 2.0, rel=1e-3)

@@ -31,7 +31,7 @@ from gmijax.sweeps.objective import why_not_comparable, with_objective
 from gmijax.sweeps.packs import most_together, require_packable
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.progress import Progress
-from gmijax.sweeps.report import Report, spread, tables
+from gmijax.sweeps.report import JobsReport, spread, tables
 from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
 
 
@@ -386,7 +386,7 @@ def test_only_a_run_with_all_its_steps_is_complete(tmp_path: Path) -> None:
 
 def shown_tables(folder: Path, jobs: Sequence[Job], sweep: SweepConfig) -> list[list[list[str]]]:
     """The rows of the tables for people."""
-    report = Report(jobs, sweep, dict, SweepPaths(folder), OpenFolder(folder, "x"), 0.0)
+    report = JobsReport(jobs, sweep, dict, SweepPaths(folder), OpenFolder(folder, "x"), 0.0)
     assert report.end("completed") is None
     columns = [table.columns for table in tables(report.data, sweep)]
     return [
@@ -565,7 +565,7 @@ def test_a_profile_counts_while_all_jobs_train(monkeypatch: pytest.MonkeyPatch) 
     now_s = 0.0
     monkeypatch.setattr(jobs_per_gpu, "running_s", lambda: now_s)
     jobs = jobs_of([compose(f"seed={seed}") for seed in range(2)])
-    window = jobs_per_gpu._Window(jobs, 60.0)
+    window = jobs_per_gpu._CurveWindow(jobs, 60.0)
     while not window.is_over():
         now_s += 0.5
         jobs[0].progress.env_steps += 50
@@ -574,7 +574,7 @@ def test_a_profile_counts_while_all_jobs_train(monkeypatch: pytest.MonkeyPatch) 
     assert window.steps_per_s == pytest.approx(200.0)
     assert window.iteration_s == pytest.approx(0.5)
     assert 14.0 < now_s < 18.0
-    late = jobs_per_gpu._Window(jobs, 5.0)
+    late = jobs_per_gpu._CurveWindow(jobs, 5.0)
     now_s += 6.0
     assert late.is_over()
     assert late.steps_per_s is None

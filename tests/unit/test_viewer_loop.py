@@ -99,8 +99,8 @@ def test_pause_stops_a_step_is_one_and_going_on_does_not_hurry() -> None:
     stand.loop.do(requests.Pause(True))
     stand.pass_s(1.0)
     assert stand.steps == 0
-    stand.loop.do(requests.Step())
-    stand.loop.do(requests.Step())
+    stand.loop.do(requests.StepRequest())
+    stand.loop.do(requests.StepRequest())
     assert stand.steps == 2
     assert stand.loop.view.paused
     stand.loop.do(requests.Pause(False))
@@ -139,7 +139,7 @@ def test_a_body_that_is_pulled_right_after_a_reset_stays_whole(task: str) -> Non
     body = stand.simulation.pushed
     at = stand.simulation.poses()[0][0, body]
     stand.loop.do(requests.Drag(0, body, at, at + np.array([0.0, 0.0, 0.3])))
-    stand.loop.do(requests.Step())
+    stand.loop.do(requests.StepRequest())
     assert stand.simulation.episodes[0].steps == 1
     assert np.abs(stand.qvel()).max() < 50.0
 
@@ -153,7 +153,7 @@ def test_a_pull_ends_with_its_episode_until_the_mouse_lets_go() -> None:
         stand.loop.do(asked)
     alone.loop.do(requests.Reset())
     for one in (stand, alone):
-        one.loop.do(requests.Step())
+        one.loop.do(requests.StepRequest())
     np.testing.assert_array_equal(stand.qvel(), alone.qvel())
 
 

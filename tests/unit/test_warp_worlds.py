@@ -10,12 +10,12 @@ from fake_warp import FakeArray, FakeWarp
 
 from gmijax.sim.impl import WarpSizes
 from gmijax.sim.warp import worlds
-from gmijax.sim.warp.worlds import OVERFLOW, STATE, Layout, Worlds, lay_out
+from gmijax.sim.warp.worlds import OVERFLOW, STATE, BufferLayout, Worlds, lay_out
 
 COUNT, SUBSTEPS = 3, 2
 
 
-def layout_with(mass_rows: int) -> Layout:
+def layout_with(mass_rows: int) -> BufferLayout:
     each = (COUNT, 2)
     state = tuple((name, each) for name in STATE)
     given = (("ctrl", each), ("body_mass", (mass_rows, 2)))

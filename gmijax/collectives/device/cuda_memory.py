@@ -84,7 +84,7 @@ class CudaMemory:
     ) -> jax.Array:
         """The array at `offset` bytes in place: a program reads what is there when it runs."""
         pointer = self.address + offset
-        view = jnp.asarray(_Region(pointer, shape, np.dtype(dtype)))
+        view = jnp.asarray(_MappedRegion(pointer, shape, np.dtype(dtype)))
         if view.unsafe_buffer_pointer() != pointer:
             raise CudaError("jax copies shared GPU memory where it should read it in place")
         return view
@@ -101,7 +101,7 @@ class CudaMemory:
         self.address = 0
 
 
-class _Region:
+class _MappedRegion:
     """Memory as the protocol describes it that jax, CuPy and Numba read arrays by."""
 
     def __init__(self, pointer: int, shape: tuple[int, ...], dtype: np.dtype) -> None:

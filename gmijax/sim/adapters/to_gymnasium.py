@@ -18,7 +18,7 @@ from gymnasium.vector.utils import batch_space
 
 from gmijax.sim.adapters.caller_arrays import Arrays, hand_out, take_in
 from gmijax.sim.adapters.pictures import Pictures
-from gmijax.sim.adapters.vector_programs import Autoreset, Outcome, VectorPrograms
+from gmijax.sim.adapters.vector_programs import Autoreset, VectorOutcome, VectorPrograms
 from gmijax.sim.interface import Env
 from gmijax.sim.stage import Image
 from gmijax.sim.wrappers import BatchState, env_keys
@@ -126,7 +126,7 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
                 f"actions of shape {actions.shape}: expected {self.action_space.shape}"
             )
         self._state, outcome = self._programs.step(state, actions)
-        out: Outcome = hand_out(outcome, self._arrays)
+        out: VectorOutcome = hand_out(outcome, self._arrays)
         info = {"is_diverged": out.is_diverged}
         if self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP:
             info |= self._final(out)
@@ -144,7 +144,7 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
         found = getattr(self, name)
         return found(*args, **kwargs) if callable(found) else (found,) * self.num_envs
 
-    def _final(self, out: Outcome) -> dict[str, Any]:
+    def _final(self, out: VectorOutcome) -> dict[str, Any]:
         """What Gymnasium says of episodes that ended; as arrays, not as objects."""
         ended = out.terminated | out.truncated
         if self._arrays == "numpy" and not ended.any():

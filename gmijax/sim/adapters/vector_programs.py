@@ -16,7 +16,7 @@ Autoreset: TypeAlias = Literal["same_step", "next_step", "disabled"]
 action does nothing there, or when `reset` is called for it."""
 
 
-class Outcome(NamedTuple):
+class VectorOutcome(NamedTuple):
     """What one step of N worlds is for the caller.
 
     Attributes:
@@ -73,16 +73,16 @@ class VectorPrograms:
         chosen = jax.device_put(chosen, self.device)
         return self._select(chosen, self.start(keys), state)
 
-    def step(self, state: BatchState, actions: Array) -> tuple[BatchState, Outcome]:
+    def step(self, state: BatchState, actions: Array) -> tuple[BatchState, VectorOutcome]:
         """One control step under actions [N, A]."""
         return self._step(self._model, state, jax.device_put(actions, self.device))
 
 
 def _same_step(
     batched: BatchedEnv, _: Autoreset, model: PyTree, state: BatchState, actions: Array
-) -> tuple[BatchState, Outcome]:
+) -> tuple[BatchState, VectorOutcome]:
     after, out = batched.step(model, state, actions)
-    return after, Outcome(
+    return after, VectorOutcome(
         obs=after.env.obs,
         reward=out.reward,
         terminated=out.terminated,
@@ -96,13 +96,13 @@ def _same_step(
 
 def _held(
     batched: BatchedEnv, autoreset: Autoreset, model: PyTree, state: BatchState, actions: Array
-) -> tuple[BatchState, Outcome]:
+) -> tuple[BatchState, VectorOutcome]:
     """Worlds that had ended before this step are not stepped: they start over, or stay."""
     had_ended = state.env.terminated | state.env.truncated
     stepped, out = batched.advance(model, state, actions)
     held = state if autoreset == "disabled" else batched.restart(model, state)
     after = select_worlds(had_ended, held, stepped)
-    return after, Outcome(
+    return after, VectorOutcome(
         obs=after.env.obs,
         reward=jnp.where(had_ended, 0.0, out.reward),
         terminated=after.env.terminated,

@@ -24,8 +24,8 @@ from gmijax.sim.warp.worlds import (
     MOVED,
     OVERFLOW,
     STATE,
-    Layout,
-    Piece,
+    BufferField,
+    BufferLayout,
     Worlds,
     lay_out,
     name_of,
@@ -148,8 +148,8 @@ class WarpStep:
         )
         (out,) = _target(self, *(tuple(part.items()) for part in layout))(joined(layout, given))
         found = {
-            name: out[piece.start - layout.first_taken :][: piece.size].reshape(piece.shape)
-            for name, piece in layout.taken.items()
+            name: out[field.start - layout.first_taken :][: field.size].reshape(field.shape)
+            for name, field in layout.taken.items()
         }
         return found | {OVERFLOW: jax.lax.bitcast_convert_type(found[OVERFLOW], jnp.int32)}
 
@@ -169,12 +169,12 @@ def moving(given: Mapping[str, Array]) -> tuple[str, ...]:
     return tuple(name for name in (*STATE, *MOVED) if name in given)
 
 
-def joined(layout: Layout, given: Mapping[str, Array]) -> Array:
+def joined(layout: BufferLayout, given: Mapping[str, Array]) -> Array:
     """The part of the buffer that goes in."""
     return jnp.concatenate(
         [
-            jnp.pad(given[name].reshape(-1).astype(jnp.float32), (0, piece.gap))
-            for name, piece in layout.given.items()
+            jnp.pad(given[name].reshape(-1).astype(jnp.float32), (0, field.gap))
+            for name, field in layout.given.items()
         ]
     )
 
@@ -189,13 +189,13 @@ def _folded(name: str, array: Array, shape: tuple[int, int], is_mapped: bool) ->
     return jnp.broadcast_to(array, (*shape, *rest)).reshape(shape[0] * shape[1], *rest)
 
 
-Pieces: TypeAlias = tuple[tuple[str, Piece], ...]
+Pieces: TypeAlias = tuple[tuple[str, BufferField], ...]
 
 
 @functools.cache
 def _target(source: WarpStep, given: Pieces, taken: Pieces) -> Callable[[Array], Any]:
     """What a program calls: from the part of the buffer that goes in to the one that comes out."""
-    layout = Layout(dict(given), dict(taken))
+    layout = BufferLayout(dict(given), dict(taken))
     worlds: dict[str, Worlds] = {}
 
     def control_step(given: Any, taken: Any) -> None:

@@ -47,7 +47,7 @@ _UNASKED = 8
 worlds have an answer: a GPU waits for that, and of two to four, as in our tasks, it saves none."""
 
 
-class Piece(NamedTuple):
+class BufferField(NamedTuple):
     """An array in the buffer: its shape, worlds first, and where it begins, in floats."""
 
     shape: tuple[int, ...]
@@ -69,7 +69,7 @@ class Piece(NamedTuple):
         return self.start + self.size + self.gap
 
 
-class Layout(NamedTuple):
+class BufferLayout(NamedTuple):
     """The buffer of N worlds: from its beginning on what goes in, to its end what comes out.
 
     The two parts overlap in the state.
@@ -79,13 +79,13 @@ class Layout(NamedTuple):
       taken: state, overflow, what the task reads.
     """
 
-    given: dict[str, Piece]
-    taken: dict[str, Piece]
+    given: dict[str, BufferField]
+    taken: dict[str, BufferField]
 
     @property
     def num_given(self) -> int:
         """Floats that go in."""
-        return max(piece.end for piece in self.given.values())
+        return max(field.end for field in self.given.values())
 
     @property
     def first_taken(self) -> int:
@@ -95,18 +95,18 @@ class Layout(NamedTuple):
     @property
     def size(self) -> int:
         """Floats in all."""
-        return max(piece.end for piece in self.taken.values())
+        return max(field.end for field in self.taken.values())
 
 
-def lay_out(given: Shapes, state: Shapes, taken: Shapes) -> Layout:
+def lay_out(given: Shapes, state: Shapes, taken: Shapes) -> BufferLayout:
     """The layout of what goes in, of what goes in and comes out, and of what comes out."""
-    pieces: dict[str, Piece] = {}
+    fields: dict[str, BufferField] = {}
     end = 0
     for name, shape in (*given, *state, *taken):
-        pieces[name] = Piece(shape, end)
-        end = pieces[name].end
+        fields[name] = BufferField(shape, end)
+        end = fields[name].end
     parts = ((*given, *state), (*state, *taken))
-    return Layout(*({name: pieces[name] for name, _ in part} for part in parts))
+    return BufferLayout(*({name: fields[name] for name, _ in part} for part in parts))
 
 
 def name_of(mj_model: mujoco.MjModel) -> str:
@@ -128,12 +128,12 @@ class Worlds:
     """
 
     def __init__(
-        self, mj_model: mujoco.MjModel, substeps: int, sizes: WarpSizes, layout: Layout
+        self, mj_model: mujoco.MjModel, substeps: int, sizes: WarpSizes, layout: BufferLayout
     ) -> None:
         mujoco_warp = mjx_warp.mujoco_warp
         count = layout.given["qpos"].shape[0]
         leaves = {name: layout.given[name] for name in MODEL_LEAVES if name in layout.given}
-        own = {name: count for name, piece in leaves.items() if piece.shape[0] == count > 1}
+        own = {name: count for name, field in leaves.items() if field.shape[0] == count > 1}
         self.model: Any = mujoco_warp.put_model(mj_model, batch_sizes=own)
         self.model.opt.graph_conditional = mj_model.opt.iterations > _UNASKED
         # Reaching that limit is meant; Warp would print a line for each world and step.
@@ -148,26 +148,26 @@ class Worlds:
         self._buffer: Any = mjx_warp.warp.zeros(layout.size, dtype=float)
         self._switches: Any = None
         self._keeps_time = "time" in layout.given
-        for name, piece in {**layout.given, **layout.taken}.items():
+        for name, field in {**layout.given, **layout.taken}.items():
             if name == SWITCHES:
-                floats = self._buffer[piece.start : piece.start + piece.size]
+                floats = self._buffer[field.start : field.start + field.size]
                 self._switches = floats, self._data.eq_active.flatten()
             else:
-                self._move(self.model if name in leaves else self._data, name, piece)
+                self._move(self.model if name in leaves else self._data, name, field)
         self._given: Any = self._buffer[: layout.num_given]
         self._taken: Any = self._buffer[layout.first_taken :]
         self._graph: Any = None
         if self._buffer.device.is_mempool_supported:
             count_memory(self._buffer.device.alias)
 
-    def _move(self, owner: Any, name: str, piece: Piece) -> None:
+    def _move(self, owner: Any, name: str, field: BufferField) -> None:
         """Puts an array of the model or of the data into the buffer."""
-        if not piece.size:
+        if not field.size:
             return
         old = getattr(owner, name)
-        assert old.size * mjx_warp.warp.types.type_size_in_bytes(old.dtype) == 4 * piece.size, name
+        assert old.size * mjx_warp.warp.types.type_size_in_bytes(old.dtype) == 4 * field.size, name
         new = mjx_warp.warp.array(
-            ptr=self._buffer.ptr + 4 * piece.start,
+            ptr=self._buffer.ptr + 4 * field.start,
             dtype=old.dtype,
             shape=old.shape,
             device=old.device,

@@ -12,7 +12,7 @@ from rich.console import Console
 from gmijax.clock import running_s
 from gmijax.machine.nvidia import GpuLoad
 from gmijax.packs.command_job import CommandJob
-from gmijax.sweeps.density import Decision, Density, Seen
+from gmijax.sweeps.density import Decision, Density, JobProgress
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.running import Running
 from gmijax.sweeps.slots import Site, Slot, SlotPool
@@ -35,7 +35,7 @@ _IDLE: Final = 0.6
 """A GPU that is busy less often has room for a second job that reports nothing."""
 
 
-class Crowd:
+class SlotLimiter:
     """Limits the slots of each GPU to what its rule decides.
 
     Attributes:
@@ -191,10 +191,10 @@ class _Gpu:
         return self.rule.assume(2 if busy < _IDLE else 1, seen)
 
 
-def _seen(here: Sequence[Running[CommandJob]], are_known: bool) -> dict[int, Seen]:
+def _seen(here: Sequence[Running[CommandJob]], are_known: bool) -> dict[int, JobProgress]:
     """Part of the whole that each has done, where that is known of all; else steps."""
     return {
-        job.number: Seen(
+        job.number: JobProgress(
             job.progress.env_steps / ((job.num_timesteps or 1) if are_known else 1),
             job.progress.reports,
         )
