@@ -30,7 +30,7 @@ from gmijax.supervise.backends import open_backend
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.run_gmis import Launch, run_gmis, taking_turns
 from gmijax.supervise.supervisor import Supervisor
-from gmijax.supervise.watched_gmi import RemoteGmiStatus
+from gmijax.supervise.watched_gmi import GmiStatus
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -65,7 +65,7 @@ def train_and_stop(
         supervisor = Supervisor(make_launch(run, modes, plan), backend)
         stopped: list[bool] = []
 
-        def stop_once(status: tuple[RemoteGmiStatus, ...]) -> None:
+        def stop_once(status: tuple[GmiStatus, ...]) -> None:
             if not stopped and all(s.state == "running" for s in status):
                 look(directories)
                 supervisor.request_stop()
@@ -147,7 +147,7 @@ def test_clients_are_terminated_before_they_are_killed(mps: FakeMps, run: RunPat
     here, plan = two_clients(mps)
     pids: list[int | None] = []
 
-    def kill_first(status: tuple[RemoteGmiStatus, ...]) -> None:
+    def kill_first(status: tuple[GmiStatus, ...]) -> None:
         if all(s.state == "running" for s in status) and not pids:
             pids.extend(s.pid for s in status)
             assert pids[0] is not None
