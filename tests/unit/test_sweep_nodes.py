@@ -236,7 +236,7 @@ def test_a_profile_of_a_job_with_two_gpus_has_both(
         def is_over(self) -> bool:
             return True
 
-    monkeypatch.setattr(jobs_per_gpu, "_Window", Window)
+    monkeypatch.setattr(jobs_per_gpu, "_CurveWindow", Window)
     monkeypatch.setattr(FakeHost, "open", lambda *_: None)
     host = FakeHost("a")
     host.machine = machine(2, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
