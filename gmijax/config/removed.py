@@ -10,10 +10,14 @@ from gmijax.errors import ConfigError
 
 
 class Removed(NamedTuple):
-    """A key that was removed."""
+    """A key that was removed.
 
-    write: str  # What to write now.
-    # Saved values with which a run goes on as it did; None: all of them.
+    Attributes:
+      write: what to write now.
+      harmless: saved values with which a run goes on as it did; None: all of them.
+    """
+
+    write: str
     harmless: tuple[Any, ...] | None = None
 
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias, get_args
 
-from gmijax.config.algo import A3cConfig, DistillConfig, PpoConfig, SacConfig
+from gmijax.config.a3c import A3cConfig
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.cluster import ClusterConfig
+from gmijax.config.distill import DistillConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.evaluation import EvalConfig
 from gmijax.config.plan import PlanConfig, ReduceConfig
+from gmijax.config.ppo import PpoConfig
 from gmijax.config.run import RunConfig, WandbConfig
+from gmijax.config.sac import SacConfig
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.config.search import SearchConfig
 from gmijax.errors import ConfigError

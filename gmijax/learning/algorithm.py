@@ -2,7 +2,7 @@
 
 In a job all GMIs of which simulate, act and train, an algorithm is one function: an iteration. The
 loop compiles it and has all else: clock, metrics, evaluations, checkpoints, the end. `docs/
-architecture.md` has the steps that add one.
+extending.md` has the steps that add one.
 """
 
 from __future__ import annotations

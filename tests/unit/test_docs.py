@@ -31,6 +31,8 @@ TASKS_PAGE = ROOT / "docs" / "tasks.md"
 FOLDERS = ("gmijax", "configs", "tests", "docs", "benchmarks", "examples", ".ci")
 
 QUOTED_PATH = re.compile(rf"`((?:{'|'.join(map(re.escape, FOLDERS))})/[\w./-]*)`")
+NAMES_BEHIND_PATH = re.compile(r"`([\w/]+\.py)` \(((?:`\w+`(?:, )?)+)\)")
+NAME_IN_PATH = re.compile(r"`(\w+)` in `([\w/]+\.py)`")
 OBS_ROW = re.compile(r"^\| (\d+)(?:-(\d+))? \|", re.MULTILINE)
 FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 ANCHOR_LINK = re.compile(r"\]\(([\w./-]*)#([^)\s]+)\)")
@@ -76,6 +78,24 @@ def test_every_folder_of_the_package_is_in_the_architecture():
     folders = {path.parent for path in files if "__pycache__" not in path.parts} - {PACKAGE}
     names = sorted(f"{path.relative_to(ROOT).as_posix()}/" for path in folders)
     assert [name for name in names if name not in quoted] == []
+
+
+@pytest.mark.parametrize("page", ["architecture.md", "extending.md"])
+def test_a_name_that_a_page_puts_into_a_file_is_there(page: str):
+    """Names in brackets behind a path, and `name` in `path`."""
+    text = (ROOT / "docs" / page).read_text()
+    pairs = [
+        (path, name)
+        for path, names in NAMES_BEHIND_PATH.findall(text)
+        for name in re.findall(r"`(\w+)`", names)
+    ] + [(path, name) for name, path in NAME_IN_PATH.findall(text)]
+    assert len(pairs) > 3
+    missing = [
+        f"{name} in {path}"
+        for path, name in pairs
+        if not re.search(rf"\b{name}\b", (ROOT / path).read_text())
+    ]
+    assert missing == []
 
 
 def test_the_architecture_is_short():

@@ -19,7 +19,8 @@ from gmijax.learning.start import begin_episodes
 from gmijax.sac.critics import critics_of, projected
 from gmijax.sac.losses import Batch, critic_loss, target_probs, temperature_loss
 from gmijax.sac.replay import CUT, GOES_ON, TERMINATED, empty_replay, insert, kind_of, sample
-from gmijax.sac.sac import SAC, target_entropy
+from gmijax.sac.sac import SAC
+from gmijax.sac.updates import target_entropy
 from gmijax.sim.interface import EnvSpec
 
 ENV = point_mass()

@@ -1,0 +1,126 @@
+"""What SAC's learner remembers, and what a GMI keeps beside it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from gmijax.config import SacConfig
+from gmijax.learning.learner import Learner, make_learner
+from gmijax.learning.normalize import Moments, no_samples
+from gmijax.learning.policy import ActorCriticParams
+from gmijax.sac.critics import critics_of
+from gmijax.sac.replay import Replay, empty_replay
+from gmijax.sim.interface import EnvSpec
+from gmijax.sim.wrappers import BatchedEnv, BatchState
+from gmijax.types import Array, PRNGKey, PyTree
+
+SacLearner: TypeAlias = Learner[SacConfig]
+
+_BETAS, _WEIGHT_DECAY = (0.9, 0.95), 1e-3
+"""Of Adam, with weight decay, as FastSAC has it."""
+
+
+class SacState(NamedTuple):
+    """All that learning must remember; equal, bit by bit, on every GMI.
+
+    Attributes:
+      params: weights of the policy; `value` is empty.
+      opt_states: of critics, policy and temperature.
+      obs_moments: statistics of all observations before this iteration.
+      learning_rate: [] float32.
+      iteration: [] int32, finished iterations.
+      key: base of the keys of updates; never consumed, only folded with iteration and rank.
+      critics: weights of both critics, [2, ...].
+      targets: slow copies of them.
+      log_temperature: [] of the weight of the entropy.
+      updates: [] int32, of the critics.
+      value_moments: None, there is no value function.
+    """
+
+    params: ActorCriticParams
+    opt_states: tuple[PyTree, PyTree, PyTree]
+    obs_moments: Moments
+    learning_rate: Array
+    iteration: Array
+    key: PRNGKey
+    critics: PyTree
+    targets: PyTree
+    log_temperature: Array
+    updates: Array
+    value_moments: None = None
+
+
+class Memory(NamedTuple):
+    """What a GMI keeps for itself: its environments, and what they have done."""
+
+    envs: BatchState
+    replay: Replay
+
+
+class SacLosses(NamedTuple):
+    """Means over an iteration's updates, [] float32 each.
+
+    Attributes:
+      critic_loss: cross-entropy, summed over both critics.
+      policy_loss: of those updates in which the policy learns.
+      entropy: of the policy in next states, in nats.
+      end_atoms: share of the targets at the ends of `value_range`; more than 0.01 says that the
+        range is too small for the rewards.
+    """
+
+    critic_loss: Array
+    policy_loss: Array
+    entropy: Array
+    end_atoms: Array
+
+
+def init(learner: SacLearner, obs_size: int, key: PRNGKey) -> SacState:
+    """The first state; consumes `key`."""
+    config, networks = learner.config, learner.networks
+    params_key, critics_key, shuffle_key = jax.random.split(key, 3)
+    params = networks.init(params_key, obs_size)
+    critics = critics_of(config).init(critics_key, obs_size, networks.distribution.action_size)
+    log_temperature = jnp.log(jnp.asarray(config.init_temperature, jnp.float32))
+    of_critics, of_policy, of_temperature = optimizers(config)
+    return SacState(
+        params=params,
+        opt_states=(
+            of_critics.init(critics),
+            of_policy.init(params),
+            of_temperature.init(log_temperature),
+        ),
+        obs_moments=no_samples((obs_size,)),
+        learning_rate=jnp.asarray(config.learning_rate, jnp.float32),
+        iteration=jnp.zeros((), jnp.int32),
+        key=shuffle_key,
+        critics=critics,
+        targets=jax.tree.map(jnp.copy, critics),
+        log_temperature=log_temperature,
+        updates=jnp.zeros((), jnp.int32),
+    )
+
+
+def begin(learner: SacLearner, env: BatchedEnv, envs: BatchState) -> Memory:
+    """The environments with an empty replay."""
+    num_envs = envs.env.reward.shape[0]
+    return Memory(envs, empty_replay(env.spec, learner.config.replay_steps, num_envs))
+
+
+def optimizers(config: SacConfig) -> tuple[optax.GradientTransformation, ...]:
+    """Of critics, policy and temperature; without the learning rate, which is in the state."""
+    adam = optax.scale_by_adam(*_BETAS)
+    clip = optax.clip_by_global_norm(config.max_grad_norm)
+    decayed = optax.flatten(optax.chain(clip, adam, optax.add_decayed_weights(_WEIGHT_DECAY)))
+    return decayed, decayed, adam
+
+
+def num_averaged(spec: EnvSpec, config: SacConfig) -> int:
+    """See `gmijax.learning.algorithm.Algorithm`."""
+    learner = make_learner(spec, config)
+    state = jax.eval_shape(lambda: init(learner, spec.obs_size, jax.random.key(0)))
+    learned = state.critics, state.params, state.log_temperature
+    return sum(leaf.size for leaf in jax.tree.leaves(learned)) + len(SacLosses._fields)
