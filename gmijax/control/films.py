@@ -48,7 +48,7 @@ def find_opengl(config: TrainConfig) -> str | None:
 
 @contextmanager
 def filmed(gl: str | None, run: RunPaths, say: Callable[[str], None]) -> Iterator[None]:
-    """The time in which evaluations of a run are filmed; what goes wrong is a line, and no error.
+    """Evaluations are filmed while this is entered; failures are printed, not raised.
 
     When it ends well, what is left is filmed. When it ends with an error, nothing is waited for.
 

@@ -86,32 +86,32 @@ def train(config: TrainConfig, *, show: Show = False) -> Result:
     started_s = time.monotonic()
     config = with_task(config)
     require_wandb(config)
-    beginning = find_start_point(config)
-    opengl = None if beginning.is_complete else find_opengl(config)
+    start_point = find_start_point(config)
+    opengl = None if start_point.is_complete else find_opengl(config)
     console = open_console(show=show)
-    if beginning.is_complete and beginning.folder is not None:
-        return _finished(config, beginning.folder, console)
-    if beginning.checkpoint is not None and (notice := source.executed(config.env)):
+    if start_point.is_complete and start_point.folder is not None:
+        return _finished(config, start_point.folder, console)
+    if start_point.checkpoint is not None and (notice := source.executed(config.env)):
         console.print(notice)
     with ExitStack() as held:
         cluster, nodes = None, None
         if config.cluster.engine is not None:
             cluster = held.enter_context(ClusterJob(config))
-            nodes = cluster.join(beginning.root(config))
-        decided = decide(started_from(config, beginning.checkpoint), console, nodes)
-        return _train(decided, beginning, console, cluster, opengl, started_s)
+            nodes = cluster.join(start_point.root(config))
+        decided = decide(started_from(config, start_point.checkpoint), console, nodes)
+        return _train(decided, start_point, console, cluster, opengl, started_s)
 
 
 def _train(
     decided: JobSpec[TrainConfig],
-    beginning: StartPoint,
+    start_point: StartPoint,
     console: Console,
     cluster: ClusterJob | None,
     opengl: str | None,
     started_s: float,
 ) -> Result:
     config, plan = decided.config, decided.plan
-    with opened(config, beginning) as (run, notes, folder):
+    with opened(config, start_point) as (run, notes, folder):
         what = (
             f"{plan.num_envs_per_gmi} environments per GMI, template {plan.template}, reduction "
             f"{plan.strategy}"
@@ -119,7 +119,7 @@ def _train(
         announce(console, run, plan, what, (*decided.reasons, *notes))
         job = _TrainingJob(decided, run, folder, console, cluster, opengl)
         try:
-            job.run_to_the_end(beginning, started_s)
+            job.run_to_the_end(start_point, started_s)
         finally:
             folder.require()  # Whatever else went wrong without it comes from that.
     summary = read_json(run.summary)
@@ -138,17 +138,17 @@ class HeldRun(NamedTuple):
 
 
 @contextmanager
-def opened(config: TrainConfig, beginning: StartPoint) -> Iterator[HeldRun]:
+def opened(config: TrainConfig, start_point: StartPoint) -> Iterator[HeldRun]:
     """The run folder of a job, held while it is entered.
 
     Raises:
       ConfigError: as `StartPoint.open` and `locked`.
     """
-    notes = beginning.notes
-    if beginning.checkpoint is not None:
-        changed = source.changes(config.env, saved_config(beginning.checkpoint)["env"])
+    notes = start_point.notes
+    if start_point.checkpoint is not None:
+        changed = source.changes(config.env, saved_config(start_point.checkpoint)["env"])
         notes = notes if changed is None else (changed, *notes)
-    run = beginning.open(config)
+    run = start_point.open(config)
     with locked(run.lock, f"run.dir={run.root}") as folder:
         record_git(run, Path.cwd())
         yield HeldRun(run, notes, folder)
@@ -180,7 +180,7 @@ class _TrainingJob:
             folder.require,
         )
 
-    def run_to_the_end(self, beginning: StartPoint, started_s: float) -> None:
+    def run_to_the_end(self, start_point: StartPoint, started_s: float) -> None:
         """Runs it, with restarts; writes the summary however it ends."""
         config, run = self._config, self._run
         new = MetricsReader(run.metrics).new
@@ -201,17 +201,17 @@ class _TrainingJob:
         write_json(run.plan, self._plan.to_dict())
         # Recorded first, so that the summary is sent too, and filmed before all is sent.
         with (
-            followed(config, run, beginning.checkpoint, self._console.print),
+            followed(config, run, start_point.checkpoint, self._console.print),
             filmed(self._opengl, run, self._console.print),
             recorded(run, partial(_what_is_left, run), record),
         ):
-            self._prepare(beginning)
+            self._prepare(start_point)
             with progress:
-                self._attempts.run_to_the_end(beginning.checkpoint, on_tick)
+                self._attempts.run_to_the_end(start_point.checkpoint, on_tick)
 
-    def _prepare(self, beginning: StartPoint) -> None:
-        checkpoint = beginning.checkpoint
-        if beginning.folder is not None:
+    def _prepare(self, start_point: StartPoint) -> None:
+        checkpoint = start_point.checkpoint
+        if start_point.folder is not None:
             clear_unfinished(self._run, checkpoint)
         elif checkpoint is not None:
             steps = CheckpointMeta.read(checkpoint).env_steps

@@ -58,7 +58,7 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
       JobInterrupted: a signal came.
     """
     started_s = time.monotonic()
-    beginnings = [find_start_point(config) for config in configs]
+    start_points = [find_start_point(config) for config in configs]
     console = open_console(show=show)
     config, plan, machine, reasons = decide(configs[0], console)
     gmis = RunPaths(folder)
@@ -66,14 +66,14 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
         members: list[_Member] = []
         folders: list[OpenFolder] = []
         notes = list(reasons)
-        for own, beginning in zip(configs, beginnings, strict=True):
-            run, changes, its_folder = held.enter_context(opened(own, beginning))
+        for own, start_point in zip(configs, start_points, strict=True):
+            run, changes, its_folder = held.enter_context(opened(own, start_point))
             folders.append(its_folder)
             own = dataclasses.replace(own, physics=config.physics)
-            members.append(_Member(started_from(own, beginning.checkpoint), run))
+            members.append(_Member(started_from(own, start_point.checkpoint), run))
             notes += changes
-            if beginning.folder is not None:
-                clear_unfinished(run, beginning.checkpoint)
+            if start_point.folder is not None:
+                clear_unfinished(run, start_point.checkpoint)
         what = f"{len(members)} runs of {plan.num_envs_per_gmi} environments in one program"
         announce(console, gmis, plan, what, tuple(dict.fromkeys(notes)))
         keep_logs(gmis, len(list(gmis.root.glob("gmi_0/attempt_*"))))

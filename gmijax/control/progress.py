@@ -168,7 +168,7 @@ class ConsoleProgress:
 
 
 def _phase_of(gmis: Sequence[GmiStatus]) -> str:
-    """What the job does: what holds up those of its GMIs that are further."""
+    """Phase of the job: that of its slowest GMIs."""
     states, early = {gmi.state for gmi in gmis}, {"starting", "waiting"}
     if states == {"waiting"}:
         return "waiting"

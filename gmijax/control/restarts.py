@@ -64,7 +64,7 @@ class Attempts:
 
     Attributes:
       run: its folder.
-      max_restarts: without a newer checkpoint in between.
+      max_restarts: allowed in a row; a new checkpoint begins the count again.
       launch_at: what to start from a checkpoint (None: from the beginning), by number of the
         attempt; raises ConfigError if nothing can be started any more.
       say: takes a line for the user.
@@ -182,14 +182,14 @@ def why_not_again(error: GmiFailed, last: GmiFailed | None) -> str | None:
     """Why a job that failed should not be tried again, None if it should."""
     if error.is_final:
         return "the last attempt left something behind, or nothing can be started"
-    if (told := error.error) is None:
+    if (reported := error.error) is None:
         return None
-    if told.type in _LASTING:
-        return f"{told.type} would happen again"
-    if _DISK_IS_FULL in told.message:
+    if reported.type in _LASTING:
+        return f"{reported.type} would happen again"
+    if _DISK_IS_FULL in reported.message:
         return "the disk is full"
     if last is not None and last.error is not None:
-        same = (error.iteration, told.type, _frames(told.traceback))
+        same = (error.iteration, reported.type, _frames(reported.traceback))
         if same == (last.iteration, last.error.type, _frames(last.error.traceback)):
             return f"the same error at the same iteration ({error.iteration}) twice"
     return None

@@ -39,8 +39,8 @@ _CLIENT_AFTER_S: Final = 30.0
 _SAME_FAULT_S: Final = 30.0
 """Jobs of a GPU that end within such a time of its fault were ended by the same one."""
 
-_OFTEN: Final = 2
-"""A job that was ended by more faults of its GPU runs alone, whoever ended first."""
+_MAX_SHARED_FAULTS: Final = 2
+"""A job that was ended by more faults of its GPU runs alone."""
 
 _THREADS: Final = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """Variables by which libraries choose the number of their threads: by default one a core."""
@@ -174,23 +174,23 @@ class CommandKind:
     def _look_at_client(
         self, running: Running[CommandJob], job: CommandJob, attempt: _Attempt
     ) -> None:
-        """Notes it where a job has no share of its GPU; until it has."""
+        """Sets the job's note while its process is no MPS client."""
         is_due = job.progress.reports > 0 and attempt.client_asked_s is None
         latest_s = attempt.client_asked_s or running.started_s
         if attempt.is_client or not (is_due or running_s() - latest_s > _CLIENT_AFTER_S):
             return
         attempt.client_asked_s = running_s()
         if running.slot.backend == "mps":
-            job.progress.note = running.host.why_no_client(running.child)
+            job.progress.note = running.host.why_no_client(running.child_id)
         attempt.is_client = job.progress.note is None
 
     def outcome(self, running: Running[CommandJob], job: CommandJob) -> JobOutcome:
         """See `Kind`."""
         seen = running.look() or ChildStatus(None)
-        if running.hung is not None:
-            return JobOutcome(error=running.hung, is_fault=True)
+        if running.hang_reason is not None:
+            return JobOutcome(error=running.hang_reason, is_fault=True)
         # One that was asked may save and end as if it were complete.
-        if running.is_killed or running.is_asked:
+        if running.ended_by_shutdown or running.is_asked:
             return JobOutcome(is_interrupted=True)
         if seen.exit_code is None:
             return JobOutcome(error=running.host.lost, is_fault=True)
@@ -218,15 +218,15 @@ class CommandKind:
     def _is_suspect(self, running: Running[CommandJob], job: CommandJob) -> bool:
         """Whether a job may have caused the fault of its GPU that ended it.
 
-        CUDA tells all clients and does not say whose fault it was: the first to end is the
-        suspect, and who has often been near.
+        CUDA tells all clients and does not say whose fault it was: the first to end is a
+        suspect, and so is a job that was there at more than `_MAX_SHARED_FAULTS` faults.
         """
         gpu, now_s = (running.slot.site, running.slot.allocations[0].gpu), running_s()
         is_first = now_s - self._faulted_s.get(gpu, -math.inf) > _SAME_FAULT_S
         if is_first:
             self._faulted_s[gpu] = now_s
         self._gpu_faults[job.number] += 1
-        return is_first or self._gpu_faults[job.number] > _OFTEN
+        return is_first or self._gpu_faults[job.number] > _MAX_SHARED_FAULTS
 
     def max_restarts(self, job: CommandJob) -> int:
         """See `Kind`."""

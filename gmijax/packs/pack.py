@@ -44,7 +44,7 @@ class PackWork(Work[CommandJob]):
     """Commands; see `Work`."""
 
     name = "pack"
-    sameness = "command and lists"
+    resume_requirement = "command and lists"
     limiters: list[SlotLimiter] = field(default_factory=list[SlotLimiter], compare=False)
 
     @property

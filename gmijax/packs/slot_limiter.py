@@ -12,7 +12,7 @@ from rich.console import Console
 from gmijax.clock import running_s
 from gmijax.machine.nvidia import GpuLoad
 from gmijax.packs.command_job import CommandJob
-from gmijax.sweeps.density import Decision, Density, JobProgress
+from gmijax.sweeps.density import ConcurrencySearch, Decision, JobProgress
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.running import Running
 from gmijax.sweeps.slots import Site, Slot, SlotPool
@@ -25,8 +25,8 @@ _LOOK_S: Final = 1.0
 _ROOM: Final = 0.95
 """Part of a GPU's memory that jobs may have."""
 
-_GROWTH: Final = 1.15
-"""A job may come to need so much more memory than it took so far."""
+_MEMORY_MARGIN: Final = 1.15
+"""Safety factor on the largest memory that a job has used so far."""
 
 _SILENT_S: Final = 180.0
 """How long a first job may run without a report until it counts as one that makes none."""
@@ -125,7 +125,7 @@ class _Gpu:
         self.device, self.title, self._host = device, title, host
         self.since_s = 0.0
         self._slots = slots
-        self.rule = Density(slots)
+        self.rule = ConcurrencySearch(slots)
         self._measured: set[tuple[str, ...]] = set()
         found = host.load_of(device)
         self._before_mib = found.used_mib if found else 0.0
@@ -166,7 +166,7 @@ class _Gpu:
         if not self.rule.is_settled:
             self._measured |= commands
         elif self._measured and self._measured.isdisjoint(commands):
-            self.rule = Density(self._slots, self.rule.target)
+            self.rule = ConcurrencySearch(self._slots, self.rule.target)
             self._measured, self._peak_mib, self._has_doubled = commands, 0.0, False
 
     def _by_memory(self, load: GpuLoad, count: int) -> Decision | None:
@@ -175,7 +175,7 @@ class _Gpu:
         if not self._peak_mib:
             return None
         room_mib = _ROOM * (load.total_mib - self._before_mib)
-        most = int(room_mib / (_GROWTH * self._peak_mib))
+        most = int(room_mib / (_MEMORY_MARGIN * self._peak_mib))
         if most >= self.rule.most:
             return None
         why = f"each takes {self._peak_mib:,.0f} of {room_mib:,.0f} MiB"

@@ -52,17 +52,19 @@ def make_allocations(
             Allocation(gmi, layout.gpu_of(gmi), "cpu", None, None, cores_of[gmi])
             for gmi in layout.gmis
         )
-    homes = _homes_of(layout, gpus, backend)
+    bindings = _bindings_of(layout, gpus, backend)
     if plan.memory_fraction is not None:
         memory = _one_each("plan.memory_fraction", plan.memory_fraction, layout)
     else:
-        sharing = Counter(home.memory for home in homes)
-        memory = [round(DEFAULT_MEMORY_FRACTION / sharing[home.memory], 4) for home in homes]
+        sharing = Counter(binding.memory for binding in bindings)
+        memory = [
+            round(DEFAULT_MEMORY_FRACTION / sharing[binding.memory], 4) for binding in bindings
+        ]
     if backend in ("mps", "mig"):
-        _require_room_for_clients(homes, machine)
+        _require_room_for_clients(bindings, machine)
     return tuple(
-        Allocation(gmi, layout.gpu_of(gmi), home.device, caps[gmi], memory[gmi], ())
-        for gmi, home in enumerate(homes)
+        Allocation(gmi, layout.gpu_of(gmi), binding.device, caps[gmi], memory[gmi], ())
+        for gmi, binding in enumerate(bindings)
     )
 
 
@@ -123,7 +125,7 @@ def _sm_percents(
 
 
 class _Binding(NamedTuple):
-    """Where a GMI lives."""
+    """The device of a GMI."""
 
     device: str  # UUID of the GPU or of the MIG instance.
     # What it shares memory with others by: the GPU, and a GPU instance of it.
@@ -131,24 +133,26 @@ class _Binding(NamedTuple):
     profile: str | None  # Of the MIG instance, None for a whole GPU.
 
 
-def _homes_of(layout: Layout, gpus: Sequence[Gpu], backend: BackendName) -> list[_Binding]:
-    """The home of every GMI, in order of id."""
-    homes: dict[int, _Binding] = {}
-    for place, (gpu, gmis) in enumerate(zip(gpus, layout.gmis_of_gpu, strict=True)):
+def _bindings_of(layout: Layout, gpus: Sequence[Gpu], backend: BackendName) -> list[_Binding]:
+    """The binding of every GMI, in order of id."""
+    bindings: dict[int, _Binding] = {}
+    for index, (gpu, gmis) in enumerate(zip(gpus, layout.gmis_of_gpu, strict=True)):
         if backend != "mig":
-            homes |= dict.fromkeys(gmis, _Binding(gpu.uuid, (place, None), None))
+            bindings |= dict.fromkeys(gmis, _Binding(gpu.uuid, (index, None), None))
             continue
         chosen = assign_instances([one.num_sms for one in gpu.instances], len(gmis))
         for gmi, number in zip(gmis, chosen, strict=True):
             one = gpu.instances[number]
-            homes[gmi] = _Binding(one.uuid, (place, one.gpu_instance), one.profile)
-    return [homes[gmi] for gmi in layout.gmis]
+            bindings[gmi] = _Binding(one.uuid, (index, one.gpu_instance), one.profile)
+    return [bindings[gmi] for gmi in layout.gmis]
 
 
-def _require_room_for_clients(homes: Sequence[_Binding], machine: Machine) -> None:
+def _require_room_for_clients(bindings: Sequence[_Binding], machine: Machine) -> None:
     new = machine.driver_major >= _NEW_DRIVER
     whole = _CLIENTS_OF_NEW_DRIVERS if new else _CLIENTS_OF_OLD_DRIVERS
-    for (_, profile), most in Counter((home.device, home.profile) for home in homes).items():
+    for (_, profile), most in Counter(
+        (binding.device, binding.profile) for binding in bindings
+    ).items():
         limit, where = whole, "a GPU"
         if profile is not None:
             # The driver lowers the limit in proportion to the instance.

@@ -21,7 +21,7 @@ from gmijax.errors import (
 )
 
 _GPU_FAULT = re.compile(r"CUDA_ERROR_(?!OUT_OF_MEMORY)|ended by SIGABRT|MPS daemon")
-"""In what a job says that lost its GPU. XLA aborts where it cannot raise."""
+"""Matches messages of jobs whose GPU faulted. XLA aborts where it cannot raise."""
 
 _NOTHING_FITS = "All configs failed during profiling"
 """What XLA says where it has no memory to try kernels."""
@@ -61,7 +61,7 @@ def ended_with(failure: GmiFailed, *kinds: type[GmijaxError]) -> bool:
 
 
 def is_consequence(failure: GmiFailed) -> bool:
-    """Whether the GMI says that another one is to blame."""
+    """Whether the GMI failed because it waited for another one."""
     return ended_with(failure, PeerLost, CollectiveTimeout, PipeClosed)
 
 
@@ -70,8 +70,8 @@ def first_cause(failures: Sequence[GmiFailed]) -> GmiFailed:
 
     A GMI that lost its peer may be seen to fail before that peer is; so a signal, and any
     error that is not about a peer, goes before errors of the exchange. A peer that is lost to
-    one may have given up on another that it waited for; and of those that waited in vain the one
-    is shown that waited for somebody who has not failed. A library
+    one may have given up on another that it waited for; of several that gave up, the one is shown
+    whose missing peer has not failed itself. A library
     may abort a process whose peer is gone; so SIGABRT comes after all other causes.
     """
     failed = {failure.gmi for failure in failures}

@@ -106,7 +106,7 @@ def quit_daemon(control: MpsControl) -> None:
 
 
 def main() -> int:
-    """Learns until the pipe ends, then cleans up unless the controller has."""
+    """Reads messages until the pipe ends, then cleans up unless the controller has."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     gmis: list[ProcessId] = []

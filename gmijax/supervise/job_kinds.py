@@ -27,7 +27,7 @@ from gmijax.partition.templates import AGENT, TRAINER, Group, group_of
 from gmijax.supervise.child import ENV_PIPES_FD
 
 ROLLOUT_PIPE_BYTES: Final = 16 << 20
-"""Of a pipe between a trainer and who makes its rollouts; larger messages go in pieces."""
+"""Of a pipe between a trainer and a GMI that makes its rollouts; larger messages are divided."""
 
 ENV_REGISTERS_FD: Final = "GMIJAX_REGISTERS_FD"
 ENV_CHANNELS_FD: Final = "GMIJAX_CHANNELS_FD"
@@ -48,7 +48,7 @@ class JobKind:
     Attributes:
       module: main of every GMI, started by name.
       shared: the memory that the GMIs of a plan share, beside that of the communicator.
-      calls: between GMIs of different nodes, which connect by TCP: who listens, and who calls.
+      calls: between GMIs of different nodes, which connect by TCP: listener and connector.
     """
 
     module: str
@@ -180,9 +180,9 @@ def groups_of(plan: Plan) -> tuple[Group, Group]:
 
 
 def calls_of(plan: Plan) -> tuple[tuple[int, int], ...]:
-    """Who listens and who calls, of the GMIs of an asynchronous job that are on different nodes.
+    """Pairs of GMIs of an asynchronous job on different nodes: listener, connector.
 
-    Agents call trainers with their experience, the leading trainer calls agents with weights.
+    Agents connect to trainers with their experience, the leading trainer to agents with weights.
     """
     agents, trainers = (group.gmis for group in groups_of(plan))
     pairs = [(trainer, agent) for trainer in trainers for agent in agents]
@@ -192,7 +192,7 @@ def calls_of(plan: Plan) -> tuple[tuple[int, int], ...]:
 
 
 def topology_of(plan: Plan) -> ChannelTopology:
-    """Who sends experience, who receives it, and on which GPU of the job each is."""
+    """The GMIs that send experience, those that receive it, and the GPU of each."""
     agents, trainers = groups_of(plan)
     layout = plan.layout
     gpu_of = tuple(layout.gpu_of(gmi) for gmi in layout.gmis)

@@ -26,7 +26,7 @@ from gmijax.supervise.watched_gmi import GmiStatus, WatchedGmi
 
 _POLL_S = 0.05
 _SETTLE_S = 1.0
-_SWEEP_S = 10.0
+_KILL_WAIT_S = 10.0
 _STACKS_S = 3.0
 """Longest wait for stacks to be written; a process that is stopped never does."""
 
@@ -138,7 +138,7 @@ class Supervisor:
             failures = self._poll_failures()
         cause = first_cause(failures)
         if ended_with(cause, CollectiveTimeout) and (alive := self._alive()):
-            # Whoever is waited for runs, and has not said anything for longest.
+            # The stuck GMI is the one that runs and has the oldest heartbeat.
             stuck = min(alive, key=lambda process: process.progress_s)
             self._collect_stacks()
             iteration = stuck.beat.iteration
@@ -255,7 +255,7 @@ class Supervisor:
         alive = _wait_for_end(alive, self._launch.timeouts.grace_s)
         for process in alive:
             process.kill()
-        alive = _wait_for_end(alive, _SWEEP_S)
+        alive = _wait_for_end(alive, _KILL_WAIT_S)
         for process in self._started.values():
             process.close()
         return [process.pid for process in alive]

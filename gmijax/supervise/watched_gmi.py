@@ -69,7 +69,7 @@ class WatchedGmi(ABC):
     @property
     @abstractmethod
     def error(self) -> ReportedError | None:
-        """The exception that it said it ends with, None without one."""
+        """The exception that it reported before it ended, None without one."""
 
     @property
     @abstractmethod

@@ -26,11 +26,11 @@ class ChildStatus(NamedTuple):
 
     Attributes:
       exit_code: None while it runs; negative for the signal that ended it.
-      said: the last line that it printed, once it has ended.
+      last_line: that it printed, once it has ended.
     """
 
     exit_code: int | None
-    said: str = ""
+    last_line: str = ""
 
 
 class Process(NamedTuple):
@@ -42,7 +42,7 @@ class Process(NamedTuple):
       log: file for what it prints; continued if it exists.
       variables: environment variables beside those of this process, and those of its slot.
       cwd: its working folder; None: that of this process.
-      order: a file, and what the process finds in it.
+      input_file: path and JSON content, written before the start.
       has_lifeline: whether its last argument is to be the number of a pipe that ends with this
         process.
       is_client: whether the process itself uses its GPU, and starts nothing that has a share.
@@ -56,7 +56,7 @@ class Process(NamedTuple):
     log: Path
     variables: Mapping[str, str] = {}
     cwd: str | None = None
-    order: tuple[Path, Mapping[str, Any]] | None = None
+    input_file: tuple[Path, Mapping[str, Any]] | None = None
     has_lifeline: bool = False
     is_client: bool = False
     memory_fraction: float | None = None
@@ -85,8 +85,8 @@ class Child:
         try:
             if process.lock is not None:
                 held = (_locked(process.lock, process.name),)
-            if process.order is not None:
-                write_json(*process.order)
+            if process.input_file is not None:
+                write_json(*process.input_file)
             with process.log.open("ab") as output:
                 self._process = subprocess.Popen(
                     [*process.arguments, *map(str, lifeline)],

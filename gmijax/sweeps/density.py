@@ -60,7 +60,7 @@ class Decision(NamedTuple):
     why: str
 
 
-class Density:
+class ConcurrencySearch:
     """Chooses the number of jobs at once on one GPU.
 
     Attributes:
@@ -117,7 +117,7 @@ class Density:
         return self._go_to(self._after(self.target), "jobs end before a rate is measured")
 
     def forbid(self, count: int, why: str) -> Decision | None:
-        """So many at once cannot run, e.g. because one of them ran out of memory."""
+        """Rules out `count` jobs at once, e.g. because one of them ran out of memory."""
         self.most = max(1, min(self.most, count - 1))
         return self.settle(self.most, why) if self.target > self.most else None
 

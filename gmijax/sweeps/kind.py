@@ -119,7 +119,7 @@ class Limiter(Protocol[J]):
         ...
 
     def forbid(self, running: Running[J], why: str) -> bool:
-        """So many as run beside this one are too many for its GPU; whether fewer can be."""
+        """Lowers the limit of its GPU below the number of its jobs; returns whether it could."""
         ...
 
 

@@ -92,15 +92,15 @@ def _run(
         report.begin()
     console.print(f"{work.name} folder: {nearby(paths.root)}")
     view = SweepView(console, jobs, work.ranking)
-    told = JobEvents(events, work.name, jobs, paths)
+    job_events = JobEvents(events, work.name, jobs, paths)
     try:
         with errors_of_files(paths):
-            _train(work, hosts, paths, console, study, report, view, jobs, told)
+            _run_jobs(work, hosts, paths, console, study, report, view, jobs, job_events)
     except BaseException as error:
         status = "interrupted" if isinstance(error, JobInterrupted) else "failed"
         if (wrong := report.end(status)) is not None:
             error.add_note(wrong)
-        told.end(report.data)
+        job_events.end(report.data)
         if isinstance(error, JobInterrupted | SweepFailed):
             error.add_note(
                 f"the same command with run.dir={shlex.quote(nearby(paths.root))} goes on"
@@ -108,7 +108,7 @@ def _run(
         raise
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
-    told.end(report.data)
+    job_events.end(report.data)
     print_outcome(console, report.data, work.ranking, paths, view.line())
     if failed:
         first = failed[0]
@@ -121,7 +121,7 @@ def _run(
     return SweepResult(paths.root, report.data)
 
 
-def _train(
+def _run_jobs(
     work: Work[J],
     hosts: Sequence[Host],
     paths: SweepPaths,
@@ -130,7 +130,7 @@ def _train(
     report: JobsReport,
     view: SweepView,
     jobs: list[J],
-    told: JobEvents,
+    job_events: JobEvents,
 ) -> None:
     """Runs the jobs; returns when all have ended."""
     with stop_signals() as signals, ExitStack() as held:
@@ -149,7 +149,7 @@ def _train(
         def tick() -> None:
             report.update()
             view.update()
-            told.update()
+            job_events.update()
 
         Scheduler(
             jobs,
@@ -191,13 +191,13 @@ def _lease(
     # In one order, so that two sweeps do not wait for each other.
     for host, site in sorted(zip(hosts, sites, strict=True), key=lambda both: both[0].name or ""):
         devices = {allocation.device for allocation in site.plan.allocations} - {"cpu"}
-        told = None
+        announced = None
         while (other := host.lease(devices)) is not None:
-            if other != told:
+            if other != announced:
                 console.print(f"another {work.name} has {other}: waiting until it ends")
             if signals.have_come:
                 raise JobInterrupted("interrupted")
-            told = other
+            announced = other
             time.sleep(_LEASE_POLL_S)
 
 
@@ -210,8 +210,8 @@ def _beginning(work: Work[J], paths: SweepPaths) -> tuple[list[J], Study[J]]:
     settings, wanted = work.settings, json.loads(json.dumps(work.identity()))
     if paths.request.exists() and read_json(paths.request) != wanted:
         raise ConfigError(
-            f"run.dir={paths.root}: holds another {work.name}; give the same {work.sameness}, or "
-            "another folder"
+            f"run.dir={paths.root}: holds another {work.name}; give the same "
+            f"{work.resume_requirement}, or another folder"
         )
     study = Study[J]()
     jobs = list(work.jobs)

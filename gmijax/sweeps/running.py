@@ -46,29 +46,29 @@ class Running(Generic[J]):
       jobs: what it runs.
       slot: where.
       host: the machine.
-      child: its number there.
+      child_id: of the process on `host`.
       readers: of their metrics.
       started_s: when, by the clock of this process.
       kill_at_s: when it is ended by force, by the clock of this process; None: it may go on.
       is_pruned: whether it was asked to end because others are better.
       is_retracted: whether that was because fewer are to run at once.
-      hung: why it was ended although nobody wanted that; None: it was not.
-      was_killed: whether it was ended by force.
-      is_killed: whether all are, because the sweep ends.
+      hang_reason: why it was killed as hung; None: it was not.
+      kill_sent: whether it was ended by force.
+      ended_by_shutdown: whether it was killed because the sweep ends.
     """
 
     jobs: tuple[J, ...]
     slot: Slot
     host: Host
-    child: int
+    child_id: int
     readers: tuple[Reader, ...]
     started_s: float = field(default_factory=running_s)
     kill_at_s: float | None = None
     is_pruned: bool = False
     is_retracted: bool = False
-    hung: str | None = None
-    was_killed: bool = False
-    is_killed: bool = False
+    hang_reason: str | None = None
+    kill_sent: bool = False
+    ended_by_shutdown: bool = False
 
     @property
     def is_asked(self) -> bool:
@@ -77,18 +77,18 @@ class Running(Generic[J]):
 
     def look(self) -> ChildStatus | None:
         """How it is; None: that is not known."""
-        return self.host.look(self.child)
+        return self.host.look(self.child_id)
 
     def order_stop(self, limit_s: float) -> None:
         """Asks it to save and end within so many seconds."""
         self.kill_at_s = self.kill_at_s or running_s() + limit_s
-        self.host.order(self.child, "ask_to_stop")
+        self.host.order(self.child_id, "ask_to_stop")
 
     def kill(self) -> None:
         """Ends it; once."""
-        if not self.was_killed:
-            self.was_killed = True
-            self.host.order(self.child, "kill")
+        if not self.kill_sent:
+            self.kill_sent = True
+            self.host.order(self.child_id, "kill")
 
     def kill_if_late(self) -> None:
         """Ends it if it was asked and has not ended in time."""

@@ -71,8 +71,8 @@ class Scheduler(Generic[J]):
         self._alone: set[int] = set()
         self._faults: Counter[int] = Counter()
         self._running: dict[int, Running[J]] = {}
-        self._awaited: dict[tuple[int, str], int | None] = {}
-        self._unwritten: OSError | None = None
+        self._compiling: dict[tuple[int, str], int | None] = {}
+        self._write_error: OSError | None = None
 
     def run(self, signals: StopSignals) -> None:
         """Returns when all jobs have ended.
@@ -89,8 +89,8 @@ class Scheduler(Generic[J]):
                 if signals.have_come:
                     raise JobInterrupted("interrupted")
                 self._look()
-                if self._unwritten is not None:
-                    raise self._unwritten
+                if self._write_error is not None:
+                    raise self._write_error
                 self._retract()
                 if not self._slots.left:
                     raise NodeLost(f"no node is left: {self._hosts[-1].lost}")
@@ -143,7 +143,7 @@ class Scheduler(Generic[J]):
         """Machines where another job compiles the same, which is found in a cache later."""
         return {
             site
-            for (site, program), number in self._awaited.items()
+            for (site, program), number in self._compiling.items()
             if program == job.program and number is not None
         }
 
@@ -154,7 +154,7 @@ class Scheduler(Generic[J]):
             job.progress.read(self._paths.job(job.number), self._ranking)
         child = host.start(ChildStart(slot, start.process))
         if start.is_awaited:
-            self._awaited.setdefault((slot.site, first.program), first.number)
+            self._compiling.setdefault((slot.site, first.program), first.number)
         self._running[first.number] = Running(jobs, slot, host, child, start.readers)
         for job in jobs:
             job.progress.begin(slot.label, host.name)
@@ -166,9 +166,9 @@ class Scheduler(Generic[J]):
             for job, reader in zip(running.jobs, running.readers, strict=True):
                 for line in reader.new():
                     job.progress.report(line, self._ranking)
-                    self._nobody_waits_for(running)
+                    self._end_compile_wait(running)
             if running_s() > running.started_s + _FIRST_REPORT_S:
-                self._nobody_waits_for(running)
+                self._end_compile_wait(running)
             if is_over:
                 self._finish(running)
             elif running.is_asked:
@@ -176,8 +176,8 @@ class Scheduler(Generic[J]):
             elif self._is_hopeless(running.jobs[0]):
                 running.is_pruned = True
                 self._order_stop(running)
-            elif (hung := self._kind.why_hung(running)) is not None:
-                running.hung = hung
+            elif (reason := self._kind.why_hung(running)) is not None:
+                running.hang_reason = reason
                 running.kill()
         self._drop_lost()
 
@@ -194,9 +194,9 @@ class Scheduler(Generic[J]):
         del self._running[running.jobs[0].number]
         ends = [self._kind.outcome(running, job) for job in running.jobs]
         exit_code = (running.look() or ChildStatus(None)).exit_code
-        running.host.order(running.child, "close")
+        running.host.order(running.child_id, "close")
         self._slots.release(running.slot)
-        self._nobody_waits_for(running)
+        self._end_compile_wait(running)
         again = [
             job
             for job, end in zip(running.jobs, ends, strict=True)
@@ -214,7 +214,11 @@ class Scheduler(Generic[J]):
         progress.slot, progress.error, progress.ended_s = "", end.error, time.monotonic()
         progress.exit_code = exit_code
         progress.state = "failed" if end.error else "completed"
-        if running.is_retracted and (end.is_interrupted or end.error) and not running.is_killed:
+        if (
+            running.is_retracted
+            and (end.is_interrupted or end.error)
+            and not running.ended_by_shutdown
+        ):
             progress.state, progress.error = "waiting", None
             return True
         if end.is_interrupted or (end.is_fault and running.is_pruned):
@@ -232,7 +236,7 @@ class Scheduler(Generic[J]):
         try:
             return self._study.is_hopeless(job)
         except OSError as error:
-            self._unwritten = self._unwritten or error
+            self._write_error = self._write_error or error
             return False
 
     def _tell(self, job: J) -> None:
@@ -240,7 +244,7 @@ class Scheduler(Generic[J]):
         try:
             self._study.tell(job)
         except OSError as error:
-            self._unwritten = self._unwritten or error
+            self._write_error = self._write_error or error
 
     def _why_again(self, running: Running[J], job: J, end: JobOutcome) -> str | None:
         """Why a job that failed runs once more, if that may help."""
@@ -260,12 +264,12 @@ class Scheduler(Generic[J]):
                 return f"again, after {error}"
         return None
 
-    def _nobody_waits_for(self, running: Running[J]) -> None:
+    def _end_compile_wait(self, running: Running[J]) -> None:
         """Its metrics are there, or it has ended, perhaps before it had compiled."""
         first = running.jobs[0]
         key = running.slot.site, first.program
-        if self._awaited.get(key) == first.number:
-            self._awaited[key] = None
+        if self._compiling.get(key) == first.number:
+            self._compiling[key] = None
 
     def _drop_lost(self) -> None:
         for site in list(self._slots.left):
@@ -286,7 +290,7 @@ class Scheduler(Generic[J]):
     def _kill_all(self) -> None:
         left = list(self._running.values())
         for running in left:
-            running.is_killed = True
+            running.ended_by_shutdown = True
             running.kill()
         deadline_s = running_s() + 2 * _KILLED_S
         for running in left:

@@ -22,27 +22,27 @@ class Slot:
       allocations: one of each of its GPUs.
       label: in words, e.g. `GPU 0 slot 1` by the index of nvidia-smi, on a node after its
         address; without GPUs the address alone, or nothing.
-      kept_free: others of its GPUs, where nobody else runs meanwhile.
-      joined: others of its GPU, whose memory and cores it has too.
+      kept_idle: allocations of its GPUs that stay idle while the job runs.
+      merged: allocations of its GPU, whose memory and cores the job has too.
       site: index of its machine.
       backend: of that machine's slots.
       is_whole_gpu: whether GPUs have one slot each.
-      is_alone: whether nobody else runs on its GPUs meanwhile.
+      is_alone: whether no other job runs on its GPUs meanwhile.
     """
 
     allocations: tuple[Allocation, ...]
     label: str
-    kept_free: tuple[Allocation, ...]
+    kept_idle: tuple[Allocation, ...]
     site: int
     backend: BackendName
     is_whole_gpu: bool
     is_alone: bool
-    joined: tuple[Allocation, ...] = ()
+    merged: tuple[Allocation, ...] = ()
 
     @property
     def size(self) -> int:
         """How many jobs it has room for."""
-        return 1 + len(self.joined)
+        return 1 + len(self.merged)
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -55,7 +55,7 @@ class Slot:
     def cpus(self) -> tuple[int, ...]:
         """Cores of its processes."""
         return tuple(
-            sorted({cpu for one in (*self.allocations, *self.joined) for cpu in one.cpus})
+            sorted({cpu for one in (*self.allocations, *self.merged) for cpu in one.cpus})
         )
 
     def memory_fraction(self, config: TrainConfig) -> float | None:
@@ -178,20 +178,20 @@ class SlotPool:
         rest = [
             allocation for allocation in emptiest[0][1:] if allocation.device == taken[0].device
         ]
-        joined = tuple(rest[: num_jobs - 1]) if num_gpus == 1 else ()
+        merged = tuple(rest[: num_jobs - 1]) if num_gpus == 1 else ()
         others = [
-            allocation for free in emptiest for allocation in free[1:] if allocation not in joined
+            allocation for free in emptiest for allocation in free[1:] if allocation not in merged
         ]
-        return self._taken(site, taken, joined, tuple(others) if alone else ())
+        return self._taken(site, taken, merged, tuple(others) if alone else ())
 
     def _taken(
         self,
         site: int,
         taken: tuple[Allocation, ...],
-        joined: tuple[Allocation, ...],
-        kept_free: tuple[Allocation, ...],
+        merged: tuple[Allocation, ...],
+        kept_idle: tuple[Allocation, ...],
     ) -> Slot:
-        gone, here = (*taken, *joined, *kept_free), self._all[site]
+        gone, here = (*taken, *merged, *kept_idle), self._all[site]
         self._free[site] = [
             allocation for allocation in self._free[site] if allocation not in gone
         ]
@@ -199,19 +199,19 @@ class SlotPool:
         label = ", ".join(self._labels[site][allocation.gmi] for allocation in taken)
         return Slot(
             taken,
-            f"{label} alone" if kept_free else label,
-            kept_free,
+            f"{label} alone" if kept_idle else label,
+            kept_idle,
             site,
             self._sites[site].plan.backend,
             is_whole_gpu=all(len(allocations) == 1 for allocations in here.values()),
             is_alone=is_alone,
-            joined=joined,
+            merged=merged,
         )
 
     def release(self, slot: Slot) -> None:
         """The job that was there has ended."""
         if slot.site in self.left:
-            free = [*self._free[slot.site], *slot.allocations, *slot.kept_free, *slot.joined]
+            free = [*self._free[slot.site], *slot.allocations, *slot.kept_idle, *slot.merged]
             self._free[slot.site] = sorted(free, key=lambda allocation: allocation.gmi)
 
     def remove_site(self, site: int) -> None:
@@ -228,7 +228,7 @@ def _by_gpu(allocations: Iterable[Allocation]) -> dict[int, list[Allocation]]:
 
 
 def _labels(site: Site) -> dict[int, str]:
-    """Slices in words."""
+    """Label of every slot, by GMI id."""
     index_of = {gpu.uuid: gpu.index for gpu in site.machine.gpus}
     index_of |= {one.uuid: gpu.index for gpu in site.machine.gpus for one in gpu.instances}
     node = f"{site.name} " if site.name else ""

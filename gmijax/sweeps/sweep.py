@@ -39,7 +39,7 @@ class SweepWork(Work[Job]):
     """Training runs; see `Work`."""
 
     name = "sweep"
-    sameness = "lists"
+    resume_requirement = "lists"
 
     @property
     def ranking(self) -> SweepConfig:

@@ -59,7 +59,7 @@ class TrainingKind:
             f"job {order.stem}",
             tuple(command(MODULE, str(order))),
             self._paths.log(first.number),
-            order=(order, {"configs": configs, "cpus": list(slot.cpus)}),
+            input_file=(order, {"configs": configs, "cpus": list(slot.cpus)}),
             has_lifeline=True,
         )
         readers = tuple(MetricsReader(run.metrics) for run in runs)
@@ -82,7 +82,7 @@ class TrainingKind:
         if seen.exit_code == 0 and not are_several:
             return JobOutcome()
         was_asked = seen.exit_code == EXIT_INTERRUPTED and running.is_asked
-        if running.is_killed or was_asked or (running.was_killed and running.is_asked):
+        if running.ended_by_shutdown or was_asked or (running.kill_sent and running.is_asked):
             return JobOutcome(is_interrupted=True)
         if seen.exit_code is None:
             return JobOutcome(error=running.host.lost, is_fault=True)
@@ -92,7 +92,7 @@ class TrainingKind:
             killed_by = signal_name(-seen.exit_code)
             error = f"its controller was killed by {killed_by}"
             return self._failed(running, job, error, is_fault=True)
-        error = seen.said.removeprefix("gmijax.train: ") or f"exit code {seen.exit_code}"
+        error = seen.last_line.removeprefix("gmijax.train: ") or f"exit code {seen.exit_code}"
         is_fault = are_several and seen.exit_code != EXIT_BAD_INPUT
         return self._failed(running, job, error, is_fault=is_fault)
 

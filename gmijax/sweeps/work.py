@@ -53,7 +53,7 @@ class Work(ABC, Generic[J]):
     name: ClassVar[str]
     """Of the command, and of its report."""
 
-    sameness: ClassVar[str]
+    resume_requirement: ClassVar[str]
     """In words, what must be the same where a command goes on."""
 
     @property
@@ -74,7 +74,7 @@ class Work(ABC, Generic[J]):
     @property
     @abstractmethod
     def processes(self) -> int:
-        """Of the largest job at each of its slots."""
+        """Most processes that a job runs at each of its slots."""
 
     @abstractmethod
     def paths(self, root: Path) -> SweepPaths:

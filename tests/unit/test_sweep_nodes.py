@@ -54,8 +54,8 @@ class FakeHost(LocalHost):
     def start(self, start: ChildStart) -> int:
         if self.lost is not None:
             raise NodeLost(self.lost)
-        assert start.process.order is not None
-        order, told = start.process.order
+        assert start.process.input_file is not None
+        order, told = start.process.input_file
         folders = [Path(config["run"]["dir"]) for config in told["configs"]]
         for folder in folders:
             folder.mkdir(exist_ok=True)

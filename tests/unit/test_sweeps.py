@@ -268,7 +268,7 @@ def test_jobs_of_one_program_have_the_memory_and_cores_of_their_slots() -> None:
     slots = gpu_slots(1, 4)
     alone = slots.acquire(1, alone=True, num_jobs=3)
     assert alone is not None
-    assert (alone.size, len(alone.kept_free), alone.is_alone) == (3, 1, True)
+    assert (alone.size, len(alone.kept_idle), alone.is_alone) == (3, 1, True)
     slots.release(alone)
     whole = slots.acquire(1, num_jobs=4)
     assert whole is not None
