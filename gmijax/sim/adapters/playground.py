@@ -1,7 +1,7 @@
-"""Environments of MuJoCo Playground: `env=playground env.name=CartpoleBalance`.
+"""Environments of MuJoCo Playground: `env=go1`, `env=playground env.name=CartpoleBalance`.
 
-Playground clones the robot models of MuJoCo Menagerie from GitHub when a locomotion or
-manipulation task is made for the first time. Its tasks of the dm_control suite need no network.
+Playground looks for the robot models of MuJoCo Menagerie in its own package, and clones them
+there from GitHub. Here they come from where `robot_models` finds them.
 """
 
 from __future__ import annotations
@@ -9,46 +9,120 @@ from __future__ import annotations
 import difflib
 import importlib
 import math
-import subprocess
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from gmijax.config.env import label_of
+from gmijax.config.schema import flatten, suggestion
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters.brax_interface import adapt
 from gmijax.sim.adapters.checks import attempt
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.physics import which_overflowed
+from gmijax.sim.robot_models import model_folder
+from gmijax.sim.robots import ROBOT_SETTINGS, playground_name
+from gmijax.sim.tasks.settings import settings_from
 from gmijax.types import Array, PyTree
 
+REWARDS = "reward_config.scales."
+"""Where Playground's configurations have the weights of the reward's terms."""
 
-def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
-    """Makes one of Playground's environments with its default configuration.
+
+def make(
+    name: str,
+    *,
+    impl: str = "auto",
+    max_envs: int | None = None,
+    rewards: Mapping[str, float] | None = None,
+    settings: Mapping[str, float] | None = None,
+) -> Env:
+    """Makes one of Playground's environments.
 
     Args:
-      name: one of `mujoco_playground.registry.ALL_ENVS`.
+      name: one of `gmijax.config.env.ROBOTS` or of `mujoco_playground.registry.ALL_ENVS`.
       impl: `auto`, `jax` or `warp`.
       max_envs: most worlds at once; MJX-Warp's buffer of contacts is for so many.
+      rewards: weights of terms of the reward by name.
+      settings: numbers by name: those of `gmijax.sim.robots`, or of Playground's configuration
+        with dots between groups.
 
     Raises:
-      ConfigError: an unknown name, models that could not be downloaded, or one that
-        Playground cannot make with the installed version of MuJoCo.
+      ConfigError: an unknown name, a model that is not here, or one that Playground cannot make
+        with the installed version of MuJoCo.
     """
-    # By name: it is not installed where gmijax is checked.
-    registry = attempt("env=playground", importlib.import_module, "mujoco_playground").registry
-    if name not in registry.ALL_ENVS:
+    registry = import_playground().registry
+    task = playground_name(name)
+    if task not in registry.ALL_ENVS:
         raise ConfigError(_unknown(name, registry.ALL_ENVS))
-    config = registry.get_default_config(name)
+    config = registry.get_default_config(task)
+    label = label_of("playground", name)
+    changed = _changed(name, flatten(config.to_dict()), rewards or {}, settings or {})
     if "impl" in config:
-        config.impl, _ = choose_impl(impl, jax.default_backend(), f"playground/{name}")
-        config.naconmax = math.ceil(config.naconmax * _growth(registry, name, max_envs))
+        changed["impl"], _ = choose_impl(impl, jax.default_backend(), label)
+        changed["naconmax"] = math.ceil(config.naconmax * _growth(registry, task, max_envs))
     elif impl == "warp":
         raise ConfigError(f"physics.impl=warp: {name} has MJX-JAX only; allowed are auto, jax")
-    theirs = attempt(f"env.name={name}", _load, registry, name, config)
-    env = from_playground(theirs, name=f"playground/{name}", episode_length=config.episode_length)
+    theirs = attempt(f"env.name={name}", registry.load, task, config_overrides=changed)
+    env = from_playground(theirs, name=label, episode_length=config.episode_length)
     return env._replace(max_envs=max_envs) if env.overflow is not None else env
+
+
+def import_playground() -> Any:
+    """The package `mujoco_playground`, which finds models as `robot_models` does."""
+    # By name: it is not installed where gmijax is checked.
+    package = attempt("env=playground", importlib.import_module, "mujoco_playground")
+    importlib.import_module("mujoco_playground._src.mjx_env").MENAGERIE_PATH = _Models()
+    return package
+
+
+class _Models:
+    """Stands for Playground's folder of models: what it asks for one is looked up."""
+
+    def exists(self) -> bool:
+        """Playground clones all models if not."""
+        return True
+
+    def __truediv__(self, name: str) -> Path:
+        return model_folder(name)
+
+
+def _changed(
+    name: str,
+    defaults: Mapping[str, Any],
+    rewards: Mapping[str, float],
+    given: Mapping[str, float],
+) -> dict[str, Any]:
+    """What `rewards` and the `given` settings make of Playground's configuration.
+
+    All of them by its keys, with dots between groups, and in its types.
+    """
+    if name in ROBOT_SETTINGS:
+        changed = settings_from(ROBOT_SETTINGS[name], given).overrides()
+    else:
+        changed = {key: _converted(defaults, key, value) for key, value in given.items()}
+    terms = [key.removeprefix(REWARDS) for key in defaults if key.startswith(REWARDS)]
+    if unknown := [term for term in rewards if term not in terms]:
+        hint = suggestion(unknown[0], terms) if terms else ""
+        raise ConfigError(f"env.rewards.{unknown[0]}: {name} has no such term{hint}")
+    return changed | {f"{REWARDS}{term}": weight for term, weight in rewards.items()}
+
+
+def _converted(defaults: Mapping[str, Any], key: str, value: float) -> bool | int | float:
+    """A number with the type that Playground's configuration has for it."""
+    numbers = {name: kind for name, kind in defaults.items() if isinstance(kind, int | float)}
+    if key not in numbers:
+        raise ConfigError(f"env.settings.{key}: no such number{suggestion(key, numbers)}")
+    kind = type(numbers[key])
+    if kind is bool and value not in (0.0, 1.0):
+        raise ConfigError(f"env.settings.{key}={value!r}: must be 0 or 1")
+    if kind is int and not value.is_integer():
+        raise ConfigError(f"env.settings.{key}={value!r}: must be a whole number")
+    return kind(value)
 
 
 def _growth(registry: Any, name: str, max_envs: int | None) -> float:
@@ -59,17 +133,6 @@ def _growth(registry: Any, name: str, max_envs: int | None) -> float:
         return 1.0
     settings = importlib.import_module(f"mujoco_playground.config.{suite}_params")
     return max(1.0, max_envs / settings.brax_ppo_config(name).num_envs)
-
-
-def _load(registry: Any, name: str, config: Any) -> Any:
-    try:
-        return registry.load(name, config=config)
-    except (OSError, subprocess.CalledProcessError) as error:
-        raise ConfigError(
-            f"env.name={name}: Playground could not download its robot models to "
-            f"{_menagerie_folder()}: make the task once where git reaches GitHub, or copy that "
-            "folder here; the dm_control tasks need none"
-        ) from error
 
 
 def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> Env:
@@ -111,10 +174,6 @@ def without_warnings(theirs: Any) -> Any:
     """
     theirs._mjx_model = theirs.mjx_model.tree_replace({"opt._impl.warn_overflow": 0})
     return theirs
-
-
-def _menagerie_folder() -> str:
-    return str(importlib.import_module("mujoco_playground._src.mjx_env").MENAGERIE_PATH)
 
 
 def _unknown(name: str, names: tuple[str, ...]) -> str:
