@@ -34,6 +34,7 @@ from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
+from gmijax.player.walking import lines_of
 from gmijax.runs.folder import (
     META,
     PlayPaths,
@@ -108,6 +109,8 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     console.print(returns_table(returns))
     if config.checkpoint != SHIPPED and (note := _return_while_training(config, returns)):
         console.print(note)
+    if "walking" in returns:
+        console.print(_walking(config, returns["walking"]))
     console.print(f"returns: {nearby(paths.returns)}")
     if not paths.model.exists():
         without_film(config, returns["env"], console)
@@ -122,6 +125,14 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
         # With its textures a robot takes 100 MB, for every checkpoint that is played.
         paths.model.unlink(missing_ok=True)
     print_next(console, *_next_steps(config))
+
+
+def _walking(config: PlayConfig, walk: Mapping[str, Any] | None) -> str:
+    if walk is not None:
+        return "\n".join(lines_of(walk))
+    if config.walking_envs == 0:
+        return "no walking test: walking_envs=0"
+    return "no walking test without a GPU, unless it is asked for: walking_envs=8 takes minutes"
 
 
 def _return_while_training(config: PlayConfig, returns: Mapping[str, Any]) -> str | None:

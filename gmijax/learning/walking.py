@@ -6,6 +6,7 @@ says of the policy is computed by `gmijax.player.walking`.
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable
 from functools import partial
@@ -16,11 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmijax.compile_once import compile_once
+from gmijax.config import EnvConfig
 from gmijax.learning.learner import Learner, acting_weights
 from gmijax.learning.normalize import normalize
-from gmijax.player.joystick import Ground, Readings, Robot
+from gmijax.player.joystick import Ground, Readings, Robot, with_pushes
 from gmijax.player.walking import LENGTH_S, Recording, Walk, measure
 from gmijax.sim.interface import Env, EnvState
+from gmijax.sim.randomize import make_worlds
 from gmijax.sim.wrappers import env_keys, select_worlds, vectorise
 from gmijax.types import Array, PyTree
 
@@ -89,6 +92,12 @@ class WalkingTest:
         )
         ground = Ground(self._env.mj_model)
         return measure(steps, self._robot, ground, self._env.spec.control_dt_s)
+
+
+def walking_env(config: EnvConfig, robot: Robot, impl: str, num_envs: int) -> Env:
+    """The environments of the test of a task: as trained, with pushes, and all with one model."""
+    tested = dataclasses.replace(with_pushes(config, robot), randomize="off", curriculum="off")
+    return make_worlds(tested, impl, seed=0, first_env=FIRST_ENV, num_envs=num_envs)
 
 
 def act_of(learner: Learner) -> Act:

@@ -6,13 +6,16 @@ environment or of many.
 
 from __future__ import annotations
 
-import re
+import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from gmijax.config import EnvConfig
+from gmijax.config.env import ROBOTS as NAMES
 
 Floats = npt.NDArray[np.float32]
 
@@ -66,33 +69,40 @@ _SPOT = ("gyro", "up_axis", "joint_pos", "joint_errors", "feet_pos", "last_actio
 
 ROBOTS: Final[Mapping[str, Robot]] = MappingProxyType(
     {
-        "Go1": Robot("go1", "home", 0.278, "", _GO1, "pert_config", "trunk", None),
-        "G1": Robot(
+        "go1": Robot("go1", "home", 0.278, "", _GO1, "pert_config", "trunk", None),
+        "g1": Robot(
             *("g1", "knees_bent", 0.755, "_pelvis", _HUMANOID, "push_config", "torso_link", 501),
             gait_hz=(1.25, 1.5),
             up_sensor="upvector_torso",
             touch_sensors=("right_foot_left_foot_found",),
         ),
-        "T1": Robot(
+        "t1": Robot(
             *("t1", "home", 0.665, "", _HUMANOID, "push_config", "Trunk", 501),
             gait_hz=(1.25, 1.75),
             holds_phase=True,
         ),
-        "Spot": Robot(
+        "spot": Robot(
             *("spot", "home", 0.46, "", _SPOT, "pert_config", "body", 201),
             least_up=0.85,
         ),
     }
 )
-"""How Playground's names of their joystick tasks begin -> robots."""
-
-_JOYSTICK: Final = re.compile(r"(Go1|G1|T1)Joystick(Flat|Rough)Terrain|(Spot)FlatTerrainJoystick")
+"""By their names in `gmijax.config.env.ROBOTS`, those of rough terrain left out."""
 
 
-def robot_of(suite: str, task: str | None) -> Robot | None:
-    """The robot of one of Playground's joystick tasks, by its name there; None of another task."""
-    found = _JOYSTICK.fullmatch(str(task)) if suite == "playground" else None
-    return None if found is None else ROBOTS[found[1] or found[3]]
+def robot_of(env: EnvConfig) -> Robot | None:
+    """The robot of one of Playground's joystick tasks, None of another task."""
+    if env.suite != "playground":
+        return None
+    names = {theirs: name for name, theirs in NAMES.items()}
+    name = names.get(str(env.name), str(env.name))
+    return ROBOTS.get(name.removesuffix("_rough"))
+
+
+def with_pushes(env: EnvConfig, robot: Robot) -> EnvConfig:
+    """The task with pushes, as the walking test has it."""
+    key = "push" if env.name in NAMES else f"{robot.pushes}.enable"
+    return dataclasses.replace(env, settings={**env.settings, key: 1.0})
 
 
 def part_sizes(robot: Robot, num_joints: int) -> tuple[tuple[str, int], ...]:

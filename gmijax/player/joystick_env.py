@@ -44,7 +44,7 @@ class JoystickEnv:
       robot: which one it is.
       model: see above.
       data: `mujoco.MjData`, which `step` moves.
-      command: [3] that the policy sees from the end of the next step on; may be set.
+      gait_hz: frequency of the gait's clock, drawn at every start; 0 without one.
     """
 
     def __init__(
@@ -68,6 +68,15 @@ class JoystickEnv:
         self._commands = _Commands(about, rng)
         self.reset()
 
+    @property
+    def command(self) -> npt.NDArray[Any]:
+        """What the robot is to do in the next step [3]; observed from its end on. May be set."""
+        return self._memory.command
+
+    @command.setter
+    def command(self, value: npt.ArrayLike) -> None:
+        self._memory = self._memory._replace(command=np.asarray(value, np.float64))
+
     def reset(self) -> Floats:
         """The next start, as Playground draws it; returns the observation [O]."""
         model, data, rng = self.model, self.data, self._rng
@@ -84,12 +93,14 @@ class JoystickEnv:
         data.ctrl[:] = data.qpos[7:]
         mujoco.mj_forward(model, data)
         num_joints = len(self._pose)
-        self._hz = 0.0 if self.robot.gait_hz is None else rng.uniform(*self.robot.gait_hz)
-        self.command = self._commands.begin()
+        self.gait_hz = 0.0 if self.robot.gait_hz is None else rng.uniform(*self.robot.gait_hz)
         if self._pusher is not None:
             self._pusher.begin()
         self._memory = _Memory(
-            np.zeros(num_joints), self.command, np.array([0.0, np.pi]), np.zeros(3 * num_joints)
+            last_action=np.zeros(num_joints),
+            command=self._commands.begin(),
+            phase=np.array([0.0, np.pi]),
+            joint_errors=np.zeros(3 * num_joints),
         )
         self._note_errors(np.zeros(num_joints))
         return self.observe()
@@ -109,12 +120,11 @@ class JoystickEnv:
         self._note_errors(targets)
         obs, told = self.observe(), self._memory.command
         # Only now, as Playground does it: see `gmijax.player.deployment.LATE`.
-        self.command = self._commands.next(self.command)
+        new = self._commands.next(told)
         self._memory = self._memory._replace(
-            last_action=action, command=self.command, phase=self._next_phase(told)
+            last_action=action, command=new, phase=self._next_phase(told)
         )
-        is_new = not np.array_equal(told, self.command)
-        return obs, self._recorded(told, is_pushed or is_new)
+        return obs, self._recorded(told, is_pushed or not np.array_equal(told, new))
 
     def observe(self) -> Floats:
         """The observation [O] by now."""
@@ -144,7 +154,7 @@ class JoystickEnv:
     def _next_phase(self, command: npt.NDArray[Any]) -> npt.NDArray[Any]:
         if self.robot.holds_phase and np.linalg.norm(command) <= 0.01:
             return np.full(2, np.pi)
-        phase = self._memory.phase + 2 * np.pi * self._about["control_dt_s"] * self._hz
+        phase = self._memory.phase + 2 * np.pi * self._about["control_dt_s"] * self.gait_hz
         return np.fmod(phase + np.pi, 2 * np.pi) - np.pi
 
     def _recorded(self, command: npt.NDArray[Any], is_disturbed: bool) -> Recording:

@@ -8,8 +8,9 @@ from typing import Any, Literal
 
 import mujoco
 
+from gmijax.config.env import ROBOTS as NAMES
 from gmijax.errors import ConfigError
-from gmijax.player.joystick import ROBOTS, Robot
+from gmijax.player.joystick import Robot
 from gmijax.sim.robot_models import model_folder, models_of
 
 
@@ -23,11 +24,10 @@ def joystick_model(robot: Robot, terrain: Literal["flat", "rough"]) -> Any:
     if spec is None or spec.origin is None:
         raise ConfigError("the models need the package playground (pip install playground)")
     xmls = Path(spec.origin).parent / "_src" / "locomotion" / robot.name / "xmls"
+    if terrain == "rough" and f"{robot.name}_rough" not in NAMES:
+        raise ConfigError(f"terrain=rough: {robot.name} has none; allowed is flat")
     scene = xmls / f"scene_mjx_feetonly_{terrain}_terrain.xml"
-    if not scene.exists():
-        raise ConfigError(f"terrain={terrain}: {robot.name} has none; allowed is flat")
-    (model,) = models_of(next(name for name, one in ROBOTS.items() if one is robot))
-    folder = model_folder(model)
+    folder = model_folder(*models_of(NAMES[robot.name]))
     files = [
         path
         for place, pattern in ((xmls, "*.xml"), (xmls / "assets", "*"), (folder, "*.xml"))

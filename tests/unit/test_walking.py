@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 import pytest
 
-from gmijax.player.joystick import ROBOTS, Ground, robot_of
+from gmijax.config import EnvConfig
+from gmijax.config.env import ROBOTS as NAMES
+from gmijax.player.joystick import ROBOTS, Ground, robot_of, with_pushes
 from gmijax.player.walking import Recording, lines_of, measure
 
 DT_S = 0.02
-GO1 = ROBOTS["Go1"]
+GO1 = ROBOTS["go1"]
 
 
 class Field:
@@ -158,7 +161,22 @@ def test_jerk_is_the_third_difference_of_positions():
 
 
 def test_which_tasks_have_the_test():
-    assert robot_of("playground", "G1JoystickRoughTerrain") is ROBOTS["G1"]
-    assert robot_of("playground", "SpotFlatTerrainJoystick") is ROBOTS["Spot"]
-    assert robot_of("playground", "Go1Getup") is None
-    assert robot_of("gmijax", "anymal") is None
+    def robot(suite, name):
+        return robot_of(EnvConfig(suite=suite, name=name, episode_length=None))
+
+    assert robot("playground", "G1JoystickRoughTerrain") is ROBOTS["g1"]
+    assert robot("playground", "g1_rough") is ROBOTS["g1"]
+    assert robot("playground", "spot") is ROBOTS["spot"]
+    assert robot("playground", "Go1Getup") is None
+    assert robot("gmijax", "anymal") is None
+
+
+def test_every_joystick_task_has_a_robot_and_a_key_that_turns_its_pushes_on():
+    for name, theirs in NAMES.items():
+        env = EnvConfig(suite="playground", name=name, episode_length=None)
+        robot = robot_of(env)
+        assert robot is not None
+        assert with_pushes(env, robot).settings == {"push": 1.0}
+        key = f"{robot.pushes}.enable"
+        given = dataclasses.replace(env, name=theirs, settings={key: 0.0})
+        assert with_pushes(given, robot).settings == {key: 1.0}

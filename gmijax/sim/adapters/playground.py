@@ -72,6 +72,14 @@ def make(
     return env._replace(max_envs=max_envs) if env.overflow is not None else env
 
 
+def configuration(name: str, settings: Mapping[str, float]) -> dict[str, Any]:
+    """Playground's configuration of a task, with what `settings` change in it; see `make`."""
+    config = import_playground().registry.get_default_config(playground_name(name))
+    changed = _changed(name, flatten(config.to_dict()), {}, settings)
+    config.update_from_flattened_dict(changed)
+    return config.to_dict()
+
+
 def import_playground() -> Any:
     """The package `mujoco_playground`, which finds models as `robot_models` does."""
     # By name: it is not installed where gmijax is checked.
