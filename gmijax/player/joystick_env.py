@@ -7,13 +7,14 @@ commands, pushes and the simulator.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
 from gmijax.player.joystick import ROBOTS, Readings, Robot
+from gmijax.player.joystick_model import joystick_model
 from gmijax.player.walking import Recording
 
 Floats = npt.NDArray[np.float32]
@@ -36,13 +37,18 @@ class JoystickEnv:
 
     Args:
       about: `robot` in the metadata of an export; see `gmijax.player.deployment`.
-      model: `mujoco.MjModel`, flat or rough; its gains and time step are set from `about`.
+      terrain: `flat` or `rough`.
       rng: starts, commands and pushes come from it.
       pushes: whether there are any.
+      noise: whether observations have that of the training.
+
+    Raises:
+      ConfigError: see `joystick_model`.
 
     Attributes:
       robot: which one it is.
-      model: see above.
+      model: `mujoco.MjModel`, with the gains and the time step of `about`.
+      control_dt_s: seconds per step.
       data: `mujoco.MjData`, which `step` moves.
       gait_hz: frequency of the gait's clock, drawn at every start; 0 without one.
     """
@@ -50,22 +56,27 @@ class JoystickEnv:
     def __init__(
         self,
         about: Mapping[str, Any],
-        model: Any,
+        terrain: Literal["flat", "rough"],
         rng: np.random.Generator,
         *,
         pushes: bool = True,
+        noise: bool = True,
     ) -> None:
-        self.robot: Robot = next(one for one in ROBOTS.values() if one.name == about["name"])
-        self._about, self._rng, self.model = about, rng, model
+        self.robot: Robot = ROBOTS[about["name"]]
+        self.model = model = joystick_model(self.robot, terrain)
+        self.control_dt_s: float = about["control_dt_s"]
+        self._about, self._rng = about, rng
         self._pose = np.array(about["default_pose_rad"])
         self._low, self._high = np.array(about["target_range_rad"]).T
         _set_gains(model, about)
         self.data = mujoco.MjData(model)
         self.readings = Readings(model, self.robot)
         self._imu = model.site(f"imu{self.robot.suffix and '_in' + self.robot.suffix}").id
-        self._substeps = round(about["control_dt_s"] / about["physics_dt_s"])
+        self._substeps = round(self.control_dt_s / about["physics_dt_s"])
         self._pusher = _pusher(about, model, rng) if pushes else None
         self._commands = _Commands(about, rng)
+        amplitudes = [np.resize(part["noise"], part["length"]) for part in about["obs"]]
+        self._noise = noise * np.concatenate(amplitudes)
         self.reset()
 
     @property
@@ -127,7 +138,7 @@ class JoystickEnv:
         return obs, self._recorded(told, is_pushed or not np.array_equal(told, new))
 
     def observe(self) -> Floats:
-        """The observation [O] by now."""
+        """The observation [O] by now; its noise is drawn anew each time."""
         data, memory = self.data, self._memory
         axes = data.site_xmat[self._imu].reshape(3, 3)
         suffix = self.robot.suffix
@@ -144,7 +155,9 @@ class JoystickEnv:
             if part in self.robot.layout:
                 values = [data.sensor(f"{name}{suffix}").data for name in names]
                 parts[part] = np.concatenate(values)
-        return np.concatenate([parts[name] for name in self.robot.layout]).astype(np.float32)
+        obs = np.concatenate([parts[name] for name in self.robot.layout])
+        noise = self._noise * self._rng.uniform(-1, 1, len(obs))
+        return (obs + noise).astype(np.float32)
 
     def _note_errors(self, targets: npt.NDArray[Any]) -> None:
         errors = np.roll(self._memory.joint_errors, len(targets))
@@ -154,7 +167,7 @@ class JoystickEnv:
     def _next_phase(self, command: npt.NDArray[Any]) -> npt.NDArray[Any]:
         if self.robot.holds_phase and np.linalg.norm(command) <= 0.01:
             return np.full(2, np.pi)
-        phase = self._memory.phase + 2 * np.pi * self._about["control_dt_s"] * self.gait_hz
+        phase = self._memory.phase + 2 * np.pi * self.control_dt_s * self.gait_hz
         return np.fmod(phase + np.pi, 2 * np.pi) - np.pi
 
     def _recorded(self, command: npt.NDArray[Any], is_disturbed: bool) -> Recording:

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from stand_in_models import make_stand_ins
 
+from gmijax.errors import ConfigError
 from gmijax.player.deployment import deployment_of
-from gmijax.player.joystick import ROBOTS
-from gmijax.player.joystick_env import JoystickEnv
-from gmijax.player.joystick_model import joystick_model
+from gmijax.player.joystick import ROBOTS, Ground
+from gmijax.player.joystick_env import JoystickEnv, _Commands
+from gmijax.player.walking import Recording, measure
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("mujoco_playground") is None, reason="needs playground"
@@ -26,21 +27,18 @@ def models(tmp_path, monkeypatch):
     return tmp_path
 
 
-def both(robot: str, terrain: str, models) -> tuple[Any, JoystickEnv]:
-    """Playground's task without noise and pushes, and ours with the metadata of its export."""
+def configured(robot: str, models, **settings) -> tuple[Any, dict[str, Any]]:
+    """Playground's task, and the metadata of its export."""
     from gmijax.sim.adapters.playground import configuration, import_playground
     from gmijax.sim.robots import ROBOT_SETTINGS, playground_name
     from gmijax.sim.tasks.settings import settings_from
 
-    task = playground_name(robot if terrain == "flat" else f"{robot}_rough")
+    task = playground_name(robot)
     make_stand_ins(models, task, robot)
-    settings = {"noise": 0.0, "push": 0.0}
-    config = configuration(robot, settings)
     changes = settings_from(ROBOT_SETTINGS[robot], settings).overrides() | {"impl": "jax"}
     theirs = import_playground().registry.load(task, config_overrides=changes)
-    about = deployment_of(ROBOTS[robot], theirs.mj_model, config)
-    model = joystick_model(ROBOTS[robot], terrain)
-    return theirs, JoystickEnv(about, model, np.random.default_rng(0), pushes=False)
+    about = deployment_of(ROBOTS[robot], theirs.mj_model, configuration(robot, settings))
+    return theirs, about
 
 
 class TheirsOnOurPhysics:
@@ -72,7 +70,8 @@ class TheirsOnOurPhysics:
 def test_observations_are_those_of_playground_at_the_same_states(robot, models, monkeypatch):
     import jax
 
-    theirs, ours = both(robot, "flat", models)
+    theirs, about = configured(robot, models, noise=0.0, push=0.0)
+    ours = JoystickEnv(about, "flat", np.random.default_rng(0), pushes=False, noise=False)
     shared = TheirsOnOurPhysics(theirs, ours, monkeypatch)
     rng = np.random.default_rng(1)
     state = theirs.reset(jax.random.PRNGKey(0))
@@ -93,3 +92,77 @@ def test_observations_are_those_of_playground_at_the_same_states(robot, models, 
         if number == 2:  # Another command, which both see one step later.
             state.info["command"] = jax.numpy.array([0.3, -0.2, 0.1])
         ours.command = state.info["command"]
+
+
+def played(env: JoystickEnv, steps: int) -> Recording:
+    """One start without any action."""
+    env.reset()
+    recorded = [env.step(np.zeros(env.model.nu))[1] for _ in range(steps)]
+    return Recording(*(np.concatenate(parts) for parts in zip(*recorded, strict=True)))
+
+
+def test_go1_at_rest_stands_and_a_limp_one_falls_though_the_task_goes_on(models):
+    _, about = configured("go1", models)
+    env = JoystickEnv(about, "flat", np.random.default_rng(0), pushes=False, noise=False)
+    walk = measure(played(env, 100), env.robot, Ground(env.model), env.control_dt_s)
+    assert (walk.upright, walk.left) == (1.0, 0.0)
+    assert 0.05 < walk.load_rms < 0.5
+    limp = JoystickEnv(
+        {**about, "kp_n_m_per_rad": [0.0] * 12}, "rough", np.random.default_rng(0), pushes=False
+    )
+    walk = measure(played(limp, 100), limp.robot, Ground(limp.model), limp.control_dt_s)
+    assert (walk.upright, walk.not_done) == (0.0, 1.0)
+    assert walk.falls["low"] == 1
+
+
+def test_commands_are_drawn_as_in_training(models):
+    _, about = configured("go1", models, command_forward_m_per_s=0.7)
+    commands = _Commands(about, np.random.default_rng(0))
+    command, seen = commands.begin(), []
+    for _ in range(50_000):
+        new = commands.next(command)
+        seen.append(new)
+        command = new
+    seen = np.array(seen)
+    largest = np.abs(seen).max(0) / [0.7, 0.8, 1.2]
+    assert (largest > 0.9).all()
+    assert (largest <= 1.0).all()
+    # An axis changes with one half, and is then not zero with 0.9, 0.25, 0.5.
+    assert (seen != 0).mean(0) == pytest.approx([0.9, 0.25, 0.5], abs=0.12)
+    assert (np.diff(seen, axis=0) != 0).any(-1).mean() == pytest.approx(0.02 / 5.0, rel=0.3)
+
+
+def test_a_humanoids_commands_last_501_steps_and_one_in_ten_is_zero(models):
+    _, about = configured("g1", models)
+    commands = _Commands(about, np.random.default_rng(0))
+    command, ends = commands.begin(), []
+    for step in range(501 * 400):
+        new = commands.next(command)
+        if not np.array_equal(new, command):
+            ends.append(step)
+        command = new
+    assert set(np.diff(ends)) <= {501, 1002}
+    draws = np.array([commands.begin() for _ in range(2000)])
+    assert (draws == 0).all(-1).mean() == pytest.approx(0.1, abs=0.03)
+    assert np.abs(draws).max(0) == pytest.approx([1.0, 0.5, 1.0], abs=0.01)
+
+
+def test_pushes_are_forces_of_go1_and_changes_of_velocity_of_g1(models):
+    _, about = configured("go1", models)
+    env = JoystickEnv(about, "flat", np.random.default_rng(3))
+    forces = []
+    for _ in range(400):
+        env.step(np.zeros(12))
+        forces.append(np.linalg.norm(env.data.xfrc_applied[env.model.body("trunk").id, :3]))
+    pushed = np.array(forces) > 0
+    assert 0 < pushed.mean() < 0.3
+    assert not env.data.xfrc_applied[env.model.body("FR_calf").id].any()
+    _, about = configured("g1", models)
+    env = JoystickEnv(about, "flat", np.random.default_rng(0))
+    assert 0 < played(env, 520).disturbed.sum() <= 3
+
+
+def test_rough_ground_is_refused_where_there_is_none(models):
+    _, about = configured("spot", models)
+    with pytest.raises(ConfigError, match="terrain=rough: spot has none"):
+        JoystickEnv(about, "rough", np.random.default_rng(0))
