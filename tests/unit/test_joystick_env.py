@@ -129,7 +129,9 @@ def test_commands_are_drawn_as_in_training(models):
     assert (largest <= 1.0).all()
     # An axis changes with one half, and is then not zero with 0.9, 0.25, 0.5.
     assert (seen != 0).mean(0) == pytest.approx([0.9, 0.25, 0.5], abs=0.12)
-    assert (np.diff(seen, axis=0) != 0).any(-1).mean() == pytest.approx(0.02 / 5.0, rel=0.3)
+    # New ones come every 5 s; in two of three an axis changes that is not zero before and after.
+    changed = (np.diff(seen, axis=0) != 0).any(-1)
+    assert 0.5 < changed.mean() / (0.02 / 5.0) < 1.0
 
 
 def test_a_humanoids_commands_last_501_steps_and_one_in_ten_is_zero(models):
