@@ -82,6 +82,7 @@ class Benchmark:
 
     def _our_command(self, folder: Path, seed: str, *, is_short: bool) -> list[str]:
         config = self._config
+        assert isinstance(config.num_envs, int)
         per_iteration = config.num_envs * getattr(config.algo, "unroll_length", 1)
         every = max(1, config.num_timesteps // per_iteration // self._given.tests)
         told = [
@@ -117,7 +118,7 @@ class Benchmark:
         command = [*module, str(self._scratch / "tests.json"), str(out)]
         cache = {"JAX_COMPILATION_CACHE_DIR": str(self._scratch / "xla")}
         code = run_command(command, self._deadline_s, cache)
-        found = read_json(out) if out.exists() else [[] for _ in self.runs]
+        found = read_json(out)["walks"] if out.exists() else [[] for _ in self.runs]
         for run, walks in zip(self.runs, found, strict=True):
             for checkpoint, walk in zip(run["checkpoints"], walks, strict=False):
                 checkpoint["walk"] = walk
@@ -197,6 +198,8 @@ def main() -> int:
     config = gmijax.compose(*given.overrides)
     if robot_of(config.env) is None:
         raise ConfigError(f"env={config.env.label}: has no walking test")
+    if not isinstance(config.num_envs, int):
+        raise ConfigError(f"num_envs={config.num_envs}: must be a number here")
     with tempfile.TemporaryDirectory() as scratch:
         benchmark = Benchmark(given, config, (given.runs or Path(scratch)).absolute())
         benchmark.run()

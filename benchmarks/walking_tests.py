@@ -1,9 +1,8 @@
 """Tests checkpoints in a process of its own: `python -m benchmarks.walking_tests IN OUT`.
 
 IN is a JSON file: `env`, the task; `impl`, of the physics; `num_envs` and `seed` of the test;
-`runs`, lists of checkpoint folders, each the fewest steps first. OUT gets, after every test, a
-list of what was found for each run: one `Walk` for each checkpoint, up to the second in a row that
-walks.
+`runs`, lists of checkpoint folders, each the fewest steps first. OUT gets, after every test,
+`walks`, a list for each run: a `Walk` for each checkpoint, up to the second in a row that walks.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ def main() -> int:
                 )
                 tests[kind].compile(policy.weights)
             walks.append(tests[kind].run(policy.weights).as_json())
-            write_json(out, found)
+            write_json(out, {"walks": found})
             if walks_twice(walks):
                 break
     return 0

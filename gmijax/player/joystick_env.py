@@ -174,15 +174,19 @@ class JoystickEnv:
         data = self.data
         has_fallen = data.sensor(self.robot.up_sensor).data[2] < self.robot.least_up
         touches = any(data.sensor(name).data[0] > 0 for name in self.robot.touch_sensors)
-        step = Recording(
-            qpos=data.qpos,
-            velocity=self.readings.velocity(data),
-            command=command,
-            disturbed=np.array(is_disturbed),
-            load=self.readings.load(data),
-            done=np.array(has_fallen or touches),
+        return Recording(
+            qpos=_alone(data.qpos),
+            velocity=_alone(self.readings.velocity(data)),
+            command=_alone(command),
+            disturbed=_alone(is_disturbed),
+            load=_alone(self.readings.load(data)),
+            done=_alone(has_fallen or touches),
         )
-        return Recording(*(np.array(part)[None, None] for part in step))
+
+
+def _alone(value: npt.ArrayLike) -> npt.NDArray[Any]:
+    """A copy with axes [T, N] of length 1 in front."""
+    return np.array(value)[None, None]
 
 
 _FEET: Final = ["FL_pos", "FR_pos", "HL_pos", "HR_pos"]

@@ -7,7 +7,7 @@ whatever made it. The marks are ours; no test of walking is agreed on.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,8 @@ import numpy.typing as npt
 from gmijax.player.joystick import Ground, Robot
 
 Floats = npt.NDArray[np.float32]
+Flags: TypeAlias = npt.NDArray[Any]
+"""Of bool; what comparisons give has no narrower type."""
 
 LENGTH_S: Final = 20.0
 NUM_ENVS: Final = 1000
@@ -43,9 +45,9 @@ class Recording(NamedTuple):
     qpos: Floats
     velocity: Floats
     command: Floats
-    disturbed: npt.NDArray[np.bool_]
+    disturbed: Flags
     load: Floats
-    done: npt.NDArray[np.bool_]
+    done: Flags
 
 
 class Errors(NamedTuple):
@@ -102,7 +104,7 @@ def measure(steps: Recording, robot: Robot, ground: Ground, control_dt_s: float)
     """Computes the test's numbers; an environment counts until it falls or leaves the field."""
     causes = _falls(steps, robot, ground)
     with np.errstate(invalid="ignore"):
-        left = (np.abs(steps.qpos[..., :2]) > ground.edge_m).any(-1)
+        left = np.any(np.abs(steps.qpos[..., :2]) > ground.edge_m, -1)
     fallen = np.any(list(causes.values()), axis=0)
     running = ~np.logical_or.accumulate(fallen | left)
     has_fallen, has_left = _which_first(fallen, left)
@@ -124,7 +126,7 @@ def measure(steps: Recording, robot: Robot, ground: Ground, control_dt_s: float)
     )
 
 
-def _falls(steps: Recording, robot: Robot, ground: Ground) -> dict[str, npt.NDArray[np.bool_]]:
+def _falls(steps: Recording, robot: Robot, ground: Ground) -> dict[str, Flags]:
     """Steps [T, N] that are a fall, by cause."""
     position, quaternion = steps.qpos[..., :3], steps.qpos[..., 3:7]
     finite = np.isfinite(steps.qpos).all(-1)
@@ -143,35 +145,31 @@ def _falls(steps: Recording, robot: Robot, ground: Ground) -> dict[str, npt.NDAr
     }
 
 
-def _which_first(
-    fallen: npt.NDArray[np.bool_], left: npt.NDArray[np.bool_]
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+def _which_first(fallen: Flags, left: Flags) -> tuple[Flags, Flags]:
     """Of each environment [N], whether it fell and whether it left; what came first counts."""
     first_fall, first_exit = (np.where(x.any(0), x.argmax(0), len(x)) for x in (fallen, left))
     return fallen.any(0) & (first_fall <= first_exit), left.any(0) & (first_exit < first_fall)
 
 
-def _share(fallen: npt.NDArray[np.bool_], left: npt.NDArray[np.bool_]) -> float | None:
+def _share(fallen: Flags, left: Flags) -> float | None:
     return None if left.all() else float((~fallen & ~left).sum() / (~left).sum())
 
 
-def _counts(
-    causes: Mapping[str, npt.NDArray[np.bool_]], fallen: npt.NDArray[np.bool_]
-) -> dict[str, int]:
+def _counts(causes: Mapping[str, Flags], fallen: Flags) -> dict[str, int]:
     """How many fell by which cause; of several in one step the first one named counts."""
     firsts = np.stack([np.where(x.any(0), x.argmax(0), len(x)) for x in causes.values()])
     which = firsts.argmin(0)[fallen]
     return {name: int((which == number).sum()) for number, name in enumerate(causes)}
 
 
-def _settled(disturbed: npt.NDArray[np.bool_], control_dt_s: float) -> npt.NDArray[np.bool_]:
+def _settled(disturbed: Flags, control_dt_s: float) -> Flags:
     """Steps [T, N] that are long enough after the start and after all disturbances."""
     step = np.arange(len(disturbed))[:, None]
     last = np.maximum.accumulate(np.where(disturbed, step, -1), axis=0)
     return step - last > round(SETTLING_S / control_dt_s)
 
 
-def _errors(steps: Recording, counted: npt.NDArray[np.bool_]) -> Errors:
+def _errors(steps: Recording, counted: Flags) -> Errors:
     if not counted.any():
         return Errors(None, None)
     error = np.square(steps.command[counted] - steps.velocity[counted], dtype=np.float64)
@@ -196,7 +194,7 @@ def _loads(loads: Floats) -> dict[str, float | None]:
     }
 
 
-def _jerk(joints: Floats, running: npt.NDArray[np.bool_], control_dt_s: float) -> float | None:
+def _jerk(joints: Floats, running: Flags, control_dt_s: float) -> float | None:
     counted = running[3:]
     if not counted.any():
         return None

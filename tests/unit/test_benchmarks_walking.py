@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from typing import Any
 
@@ -33,7 +34,9 @@ def test_a_training_walks_from_the_first_of_two_checkpoints_in_a_row():
 
 
 def test_the_last_checkpoint_is_enough_if_nothing_was_left_out():
-    assert walks_from(checkpoints(False, True), is_complete=True)["env_steps"] == 20
+    found = walks_from(checkpoints(False, True), is_complete=True)
+    assert found is not None
+    assert found["env_steps"] == 20
     assert walks_from(checkpoints(False, True), is_complete=False) is None
     assert walks_from(checkpoints(False, True, None), is_complete=True) is None
     assert walks_from([], is_complete=True) is None
@@ -95,17 +98,21 @@ def test_our_policy_acts_in_jax_as_in_numpy(tmp_path):
 def test_a_policy_of_brax_gets_its_observations_by_name(tmp_path):
     pytest.importorskip("brax")
     import jax
-    from brax.training.acme import running_statistics, specs
-    from brax.training.agents.ppo import checkpoint, networks
-    from ml_collections import config_dict
+
+    # By name: it is not installed where gmijax is checked.
+    statistics_of = importlib.import_module("brax.training.acme.running_statistics")
+    specs = importlib.import_module("brax.training.acme.specs")
+    checkpoint = importlib.import_module("brax.training.agents.ppo.checkpoint")
+    networks = importlib.import_module("brax.training.agents.ppo.networks")
+    config_dict = importlib.import_module("ml_collections.config_dict")
 
     sizes = {"state": (5,), "privileged_state": (8,)}
     kwargs = {"policy_hidden_layer_sizes": (4,), "policy_obs_key": "state"}
     network = networks.make_ppo_networks(
-        sizes, 2, preprocess_observations_fn=running_statistics.normalize, **kwargs
+        sizes, 2, preprocess_observations_fn=statistics_of.normalize, **kwargs
     )
     shapes = {name: specs.Array(shape, np.dtype("float32")) for name, shape in sizes.items()}
-    statistics = running_statistics.init_state(shapes)
+    statistics = statistics_of.init_state(shapes)
     key = jax.random.key(0)
     params = (statistics, network.policy_network.init(key), network.value_network.init(key))
     config = config_dict.ConfigDict(

@@ -106,6 +106,7 @@ def test_go1_at_rest_stands_and_a_limp_one_falls_though_the_task_goes_on(models)
     env = JoystickEnv(about, "flat", np.random.default_rng(0), pushes=False, noise=False)
     walk = measure(played(env, 100), env.robot, Ground(env.model), env.control_dt_s)
     assert (walk.upright, walk.left) == (1.0, 0.0)
+    assert walk.load_rms is not None
     assert 0.05 < walk.load_rms < 0.5
     limp = JoystickEnv(
         {**about, "kp_n_m_per_rad": [0.0] * 12}, "rough", np.random.default_rng(0), pushes=False
