@@ -40,14 +40,16 @@ class Recording(NamedTuple):
       disturbed: [T, N] bool, there was a push in the step, or a new command at its end.
       load: [T, N, A] torque of every driven joint over its limit.
       done: [T, N] bool, the task would end here by its own rule.
+
+    Arrays are of numpy, and of JAX while they are recorded there.
     """
 
-    qpos: Floats
-    velocity: Floats
-    command: Floats
-    disturbed: Flags
-    load: Floats
-    done: Flags
+    qpos: Any
+    velocity: Any
+    command: Any
+    disturbed: Any
+    load: Any
+    done: Any
 
 
 class Errors(NamedTuple):
@@ -106,7 +108,7 @@ def measure(steps: Recording, robot: Robot, ground: Ground, control_dt_s: float)
     with np.errstate(invalid="ignore"):
         left = np.any(np.abs(steps.qpos[..., :2]) > ground.edge_m, -1)
     fallen = np.any(list(causes.values()), axis=0)
-    running = ~np.logical_or.accumulate(fallen | left)
+    running = ~np.logical_or.accumulate(np.logical_or(fallen, left))
     has_fallen, has_left = _which_first(fallen, left)
     settled = running & _settled(steps.disturbed, control_dt_s)
     upright = _share(has_fallen, has_left)
@@ -135,8 +137,8 @@ def _falls(steps: Recording, robot: Robot, ground: Ground) -> dict[str, Flags]:
         squares = np.square(quaternion)
         # The z of the trunk's own z axis.
         up = 1 - 2 * (squares[..., 1] + squares[..., 2]) / squares.sum(-1)
-        low = height < robot.height_m / 2
-        tilted = up < np.cos(np.radians(MOST_TILT_DEG))
+        low: Any = height < robot.height_m / 2
+        tilted: Any = up < np.cos(np.radians(MOST_TILT_DEG))
     return {
         "not_finite": ~finite,
         "low": low & finite,
