@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import importlib.util
+import json
+import runpy
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from stand_in_models import make_stand_ins
 
+from gmijax.config import EnvConfig
+from gmijax.deploy.policy import Policy
 from gmijax.errors import ConfigError
 from gmijax.player.deployment import deployment_of
 from gmijax.player.joystick import ROBOTS, Ground
@@ -169,3 +175,55 @@ def test_rough_ground_is_refused_where_there_is_none(models):
     _, about = configured("spot", models)
     with pytest.raises(ConfigError, match="terrain=rough: spot has none"):
         JoystickEnv(about, "rough", np.random.default_rng(0))
+
+
+def test_an_export_has_the_layout_unless_the_policy_sees_what_no_robot_does(models):
+    from gmijax.workers.exporter import _robot
+
+    theirs, _ = configured("go1", models)
+    spec = SimpleNamespace(action_size=12)
+    env: Any = SimpleNamespace(spec=spec, mj_model=theirs.mj_model)
+    config = EnvConfig(
+        suite="playground", name="go1", episode_length=None, settings={"action_scale_rad": 0.3}
+    )
+    found = json.loads(json.dumps(_robot(config, env, 48)))
+    assert sum(length for _, length in found["obs_terms"]) == 48
+    about = found["robot"]
+    assert about["action_scale_rad"] == 0.3
+    assert (about["history"], about["action_repeat"]) == (1, 1)
+    assert about["default_pose_rad"][:3] == pytest.approx([0.1, 0.9, -1.8])
+    assert set(about["kp_n_m_per_rad"]) == {35.0}
+    assert about["torque_limit_n_m"][:3] == pytest.approx([23.7, 23.7, 35.55])
+    late = [part["name"] for part in about["obs"] if part["delay_steps"]]
+    assert late == ["last_action", "command"]
+    ends = [part["start"] + part["length"] for part in about["obs"]]
+    assert [part["start"] for part in about["obs"]] == [0, *ends[:-1]]
+    assert _robot(config, env, 123) == {}
+    assert _robot(dataclasses.replace(config, name="Go1Getup"), env, 48) == {}
+
+
+def test_gains_are_those_of_motors_and_joints_together(models):
+    _, about = configured("spot", models)
+    assert set(about["kp_n_m_per_rad"]) == {300.0}
+    assert about["kd_n_m_s_per_rad"] == pytest.approx([21.0] * 12)
+    assert about["torque_limit_n_m"] == [None] * 12
+    _, about = configured("g1", models)
+    assert about["kd_n_m_s_per_rad"][:6] == pytest.approx([2, 2, 2, 2, 1, 0.2])
+    assert about["torque_limit_n_m"][:2] == pytest.approx([88, 139])
+
+
+def test_the_example_prints_the_walking_test(models, monkeypatch, capsys):
+    _, about = configured("go1", models)
+    about |= {"history": 1, "action_repeat": 1}
+    policy = Policy(lambda obs: np.zeros((len(obs), 12)), 48, 12, {"robot": about})
+    monkeypatch.setattr("gmijax.load_policy", lambda path: policy)
+    example = runpy.run_path("examples/sim2sim.py")
+    line = ["sim2sim.py", "policy.onnx", "--terrain", "rough", "--envs", "2", "--seconds", "1"]
+    monkeypatch.setattr("sys.argv", line)
+    assert example["main"]() == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("walking test: 2 environments, 1 s each")
+    assert shown.endswith("walks: no\n")
+    policy.metadata = {}
+    with pytest.raises(ConfigError, match="not a policy of env=go1"):
+        example["main"]()
