@@ -138,7 +138,7 @@ def test_a_model_that_is_missing_is_said_with_the_line_that_gets_it(
     menagerie.__dict__.update(Cache=lambda: cache, names=lambda: ["unitree_go1"], get=str)
     monkeypatch.setitem(sys.modules, PACKAGE, menagerie)
     said = (
-        "env=go1: the model of unitree_go1 is not here; get it with: mujoco-menagerie prefetch "
+        "env=go1: the model of unitree_go1 is not here; get with: mujoco-menagerie prefetch "
         "unitree_go1 (without internet: docs/tasks.md)"
     )
     assert refused("env=go1") == said

@@ -146,10 +146,11 @@ def _changed(
 
 def _converted(defaults: Mapping[str, Any], key: str, value: float) -> bool | int | float:
     """A number with the type that Playground's configuration has for it."""
-    numbers = {name: kind for name, kind in defaults.items() if isinstance(kind, int | float)}
+    numbers = [name for name, number in defaults.items() if isinstance(number, int | float)]
     if key not in numbers:
-        raise ConfigError(f"env.settings.{key}: no such number{suggestion(key, numbers)}")
-    kind = type(numbers[key])
+        known = [name for name in numbers if not name.startswith(REWARDS)]
+        raise ConfigError(f"env.settings.{key}: no such number{suggestion(key, known)}")
+    kind = type(defaults[key])
     if kind is bool and value not in (0.0, 1.0):
         raise ConfigError(f"env.settings.{key}={value!r}: must be 0 or 1")
     if kind is int and not value.is_integer():
