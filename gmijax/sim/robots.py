@@ -116,7 +116,7 @@ class HumanoidRobotSettings(RangedSettings):
         default=1.0,
         positive=True,
     )
-    push: float = doc("1: the robot is pushed every 5 to 10 s; 0: never", default=1.0)
+    push: float = doc("1: the robot is pushed now and then; 0: never", default=1.0)
     push_min_m_per_s: float = doc(
         "pushes: least change of the trunk's velocity, m/s", default=0.1, low=0
     )

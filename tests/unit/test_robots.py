@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 import sys
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -19,6 +21,8 @@ from gmijax.sim.registry import draws_models, require_env
 from gmijax.sim.robot_models import PACKAGE, find_model, models_of
 from gmijax.sim.robots import ROBOT_SETTINGS
 from gmijax.sim.tasks.settings import settings_from
+
+TASKS_PAGE = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
 
 
 def module_that_is_installed(name: str) -> ModuleType:
@@ -176,3 +180,16 @@ def test_settings_of_other_tasks_have_the_names_of_their_groups(tmp_path: Path) 
     assert env.settings == {"noise_config.level": 2.0}
     env = gmijax.compose(f"run.resume={run.root}", "env.rewards.torques=2").env
     assert (env.settings, env.rewards) == ({"noise_config.level": 0.5}, {"torques": 2.0})
+
+
+def test_settings_in_the_documents_are_those_of_the_code() -> None:
+    rows = re.findall(
+        r"^\| `(\w+)` \| (.*) \|$", TASKS_PAGE.partition("## Robots")[2], re.MULTILINE
+    )
+    documented = {name: cells.split(" | ") for name, cells in rows if cells.count(" | ") == 4}
+    for column, name in enumerate(("go1", "g1", "t1", "spot"), 1):
+        fields = dataclasses.fields(ROBOT_SETTINGS[name])
+        found = {key: cells for key, cells in documented.items() if cells[column].strip()}
+        assert {key: (cells[0], float(cells[column])) for key, cells in found.items()} == {
+            field.name: (field.metadata["doc"], field.default) for field in fields
+        }
