@@ -134,7 +134,7 @@ def _choices_of_run(name: str, items: Sequence[Override]) -> list[str]:
         return []
     saved = saved_config_of(run, key)
     suite, task = saved["env"].get("suite", "gmijax"), saved["env"].get("name")
-    chosen = {"env": choice_of(suite, task)}
+    chosen = {"env": choice_of(str(suite), str(task))}
     if name == "train":
         chosen["algo"] = saved["algo"].get("name", "ppo")
     return [

@@ -54,7 +54,7 @@ from gmijax.runs.resume import (
 )
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
-from gmijax.sim.registry import require_env
+from gmijax.sim.registry import draws_models, require_env
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.run_gmis import Launch, run_gmis
 from gmijax.viewer.installed import INSTALL, missing
@@ -168,7 +168,7 @@ def _require_page(config: PlayConfig) -> None:
 def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
     """As `open_run`, with what only playing asks for checked too."""
     config, env, changed = open_run(config)
-    if config.randomize == "on" and not env.randomization:
+    if config.randomize == "on" and not draws_models(env):
         raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
     return config, changed
 

@@ -119,19 +119,24 @@ def _run_chunk(
     def step(before: EnvState, _: None) -> tuple[EnvState, Recording]:
         after = env.step(model, before, act(weights, before.obs))
         data = after.physics.data
-        recorded = Recording(
-            qpos=data.qpos,
-            velocity=readings.velocity(data),
-            command=before.task.info["command"],
-            disturbed=_disturbed(before, after),
-            load=readings.load(data),
-            done=after.terminated,
-        )
         # One with bad numbers stays where it was: others may share buffers with it.
         bad = ~jnp.isfinite(data.qpos).all(-1) | ~jnp.isfinite(data.qvel).all(-1)
-        return select_worlds(bad, before, after), recorded
+        return select_worlds(bad, before, after), recorded(readings, before, after)
 
     return jax.lax.scan(step, state, length=CHUNK_STEPS)
+
+
+def recorded(readings: Readings, before: EnvState, after: EnvState) -> Recording:
+    """One step of environments [N], without the axis of time."""
+    data = after.physics.data
+    return Recording(
+        qpos=data.qpos,
+        velocity=readings.velocity(data),
+        command=before.task.info["command"],
+        disturbed=_disturbed(before, after),
+        load=readings.load(data),
+        done=after.terminated,
+    )
 
 
 def _disturbed(before: EnvState, after: EnvState) -> Array:

@@ -17,7 +17,7 @@ from gmijax.errors import ConfigError
 from gmijax.machine.xla_on_cpu import missing_on_cpu
 from gmijax.sim import source
 from gmijax.sim.robot_models import require_models
-from gmijax.sim.robots import ROBOT_SETTINGS, playground_name
+from gmijax.sim.robots import ROBOT_SETTINGS, has_randomizer, playground_name
 from gmijax.sim.tasks.settings import CURRICULA, SETTINGS, settings_from
 
 if TYPE_CHECKING:
@@ -74,7 +74,32 @@ def require_env(env: EnvConfig) -> None:
     has_curriculum = env.curriculum == "on"
     _require_changes(str(env.name), env.suite, env.rewards, env.settings, has_curriculum)
     if env.suite == "playground":
+        _require_randomizer(env)
         require_models(playground_name(str(env.name)), env.label)
+
+
+def draws_models(env: EnvConfig) -> bool:
+    """Whether there is anything that `env.randomize` could draw."""
+    brings = env.suite == "playground" and has_randomizer(playground_name(str(env.name)))
+    return bool(env.randomization) or brings
+
+
+def _require_randomizer(env: EnvConfig) -> None:
+    """Raises ConfigError for a randomisation that a task of Playground cannot have."""
+    if env.randomization:
+        raise ConfigError(
+            f"env.randomization.{next(iter(env.randomization))}: not with env={env.label}; tasks "
+            "of Playground bring what they draw, or draw nothing"
+        )
+    if env.randomize == "episode":
+        raise ConfigError(
+            f"env.randomize=episode: not with env={env.label}, whose episodes all begin with the "
+            "first start of their environment; allowed are off, on"
+        )
+    if env.randomize == "on" and not draws_models(env):
+        raise ConfigError(
+            f"env.randomize=on: Playground has no randomisation for {env.label}; allowed is off"
+        )
 
 
 def _require_changes(

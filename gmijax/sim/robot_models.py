@@ -65,7 +65,7 @@ def find_model(name: str) -> Path | None:
         return _whole(Path(root) / name)
     if importlib.util.find_spec(PACKAGE) is not None:
         # By name: it is not installed where gmijax is checked.
-        menagerie = importlib.import_module(PACKAGE)
+        menagerie = importlib.import_module("mujoco_menagerie")
         cache = menagerie.Cache()
         if name in menagerie.names() and cache.is_cached(robot := menagerie.get(name)):
             return _whole(cache.model_path(robot))
@@ -91,12 +91,12 @@ def _clone() -> Path | None:
 
 def how_to_get(names: Sequence[str]) -> str:
     """What to do about models that are not here."""
-    listed = " ".join(names)
     if root := os.environ.get("MENAGERIE_ROOT"):
         return f"MENAGERIE_ROOT={root} has no model {names[0]} (docs/tasks.md)"
     if importlib.util.find_spec(PACKAGE) is None:
         return f"needs the package {PACKAGE} (pip install 'gmijax[playground]')"
+    which = f"model of {names[0]} is" if len(names) == 1 else f"models of {', '.join(names)} are"
     return (
-        f"the model of {' and '.join(names)} is not here; get it with: "
-        f"mujoco-menagerie prefetch {listed} (without internet: docs/tasks.md)"
+        f"the {which} not here; get with: mujoco-menagerie prefetch {' '.join(names)} "
+        "(without internet: docs/tasks.md)"
     )

@@ -14,6 +14,7 @@ from typing import Any
 from gmijax.config.env import ROBOTS
 from gmijax.config.schema import doc
 from gmijax.errors import ConfigError
+from gmijax.sim.impl import WarpSizes
 from gmijax.sim.tasks.settings import TaskSettings
 
 
@@ -115,7 +116,7 @@ class HumanoidRobotSettings(RangedSettings):
         default=1.0,
         positive=True,
     )
-    push: float = doc("1: the robot is pushed every 5 to 10 s; 0: never", default=1.0)
+    push: float = doc("1: the robot is pushed now and then; 0: never", default=1.0)
     push_min_m_per_s: float = doc(
         "pushes: least change of the trunk's velocity, m/s", default=0.1, low=0
     )
@@ -189,7 +190,24 @@ ROBOT_SETTINGS: Mapping[str, type[RobotSettings]] = MappingProxyType(
 )
 """The names of `ROBOTS` -> their settings."""
 
+BUFFERS: Mapping[str, WarpSizes] = MappingProxyType(
+    {
+        "G1JoystickRoughTerrain": WarpSizes(contacts_per_env=16, constraints_per_env=128),
+        "Go1JoystickRoughTerrain": WarpSizes(contacts_per_env=8, constraints_per_env=60),
+        "T1JoystickRoughTerrain": WarpSizes(contacts_per_env=16, constraints_per_env=96),
+    }
+)
+"""MJX-Warp's buffers for Playground's tasks on rough ground. Its own are too small, or written by
+the constructor over what was configured (Go1). In MuJoCo in C a world, fallen robots too, had at
+most 21 contacts and 113 rows (G1), 16 and 88 (T1), 9 and 48 (Go1). All worlds share the buffer of
+contacts, so one that needs more than its part finds room."""
+
 
 def playground_name(name: str) -> str:
     """Playground's name of a task, given that or one of `ROBOTS`."""
     return ROBOTS.get(name, name)
+
+
+def has_randomizer(task: str) -> bool:
+    """Whether Playground brings domain randomisation for a task, by its name there."""
+    return task.startswith(("Aero", "Berkeley", "G1", "Go1", "Leap", "T1"))

@@ -9,7 +9,9 @@ from __future__ import annotations
 import difflib
 import importlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +27,9 @@ from gmijax.sim.impl import choose_impl
 from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.physics import which_overflowed
 from gmijax.sim.robot_models import model_folder
-from gmijax.sim.robots import ROBOT_SETTINGS, playground_name
+from gmijax.sim.robots import BUFFERS, ROBOT_SETTINGS, has_randomizer, playground_name
 from gmijax.sim.tasks.settings import settings_from
-from gmijax.types import Array, PyTree
+from gmijax.types import Array, PRNGKey, PyTree
 
 REWARDS = "reward_config.scales."
 """Where Playground's configurations have the weights of the reward's terms."""
@@ -64,11 +66,14 @@ def make(
     changed = _changed(name, flatten(config.to_dict()), rewards or {}, settings or {})
     if "impl" in config:
         changed["impl"], _ = choose_impl(impl, jax.default_backend(), label)
-        changed["naconmax"] = math.ceil(config.naconmax * _growth(registry, task, max_envs))
+        changed = _buffers(registry, task, config, max_envs) | changed
     elif impl == "warp":
         raise ConfigError(f"physics.impl=warp: {name} has MJX-JAX only; allowed are auto, jax")
     theirs = attempt(f"env.name={name}", registry.load, task, config_overrides=changed)
     env = from_playground(theirs, name=label, episode_length=config.episode_length)
+    if has_randomizer(task):
+        draw = partial(_drawn, theirs, registry.get_domain_randomizer(task))
+        env = env._replace(draw_models=draw)
     return env._replace(max_envs=max_envs) if env.overflow is not None else env
 
 
@@ -99,6 +104,33 @@ class _Models:
         return model_folder(name)
 
 
+def _drawn(theirs: Any, randomize: Callable[..., Any], keys: PRNGKey) -> dict[str, Array]:
+    """The leaves of its model that Playground draws, by name: [N, ...] for `keys` [N]."""
+    model, axes = randomize(theirs.mjx_model, jax.random.key_data(keys))
+    leaves = _by_name(model)
+    return {name: leaves[name] for name in _by_name(axes)}
+
+
+def _by_name(tree: PyTree) -> dict[str, Any]:
+    """The leaves by their names, with dots between groups."""
+    named = jax.tree.leaves_with_path(tree)
+    return {jax.tree_util.keystr(at).removeprefix("."): leaf for at, leaf in named}
+
+
+@contextmanager
+def _with_leaves(theirs: Any, leaves: Mapping[str, Array]) -> Iterator[None]:
+    """Within it the model of `theirs` has these leaves, drawn for one world.
+
+    As in Playground's own wrapper. A tracer that stayed there would break what is traced next.
+    """
+    nominal = theirs.mjx_model
+    theirs._mjx_model = nominal.tree_replace(dict(leaves))
+    try:
+        yield
+    finally:
+        theirs._mjx_model = nominal
+
+
 def _changed(
     name: str,
     defaults: Mapping[str, Any],
@@ -122,10 +154,11 @@ def _changed(
 
 def _converted(defaults: Mapping[str, Any], key: str, value: float) -> bool | int | float:
     """A number with the type that Playground's configuration has for it."""
-    numbers = {name: kind for name, kind in defaults.items() if isinstance(kind, int | float)}
+    numbers = [name for name, number in defaults.items() if isinstance(number, int | float)]
     if key not in numbers:
-        raise ConfigError(f"env.settings.{key}: no such number{suggestion(key, numbers)}")
-    kind = type(numbers[key])
+        known = [name for name in numbers if not name.startswith(REWARDS)]
+        raise ConfigError(f"env.settings.{key}: no such number{suggestion(key, known)}")
+    kind = type(defaults[key])
     if kind is bool and value not in (0.0, 1.0):
         raise ConfigError(f"env.settings.{key}={value!r}: must be 0 or 1")
     if kind is int and not value.is_integer():
@@ -133,14 +166,22 @@ def _converted(defaults: Mapping[str, Any], key: str, value: float) -> bool | in
     return kind(value)
 
 
-def _growth(registry: Any, name: str, max_envs: int | None) -> float:
-    """How much larger a buffer for all worlds must be than theirs, which is for their training."""
+def _buffers(registry: Any, task: str, config: Any, max_envs: int | None) -> dict[str, int]:
+    """Sizes of MJX-Warp's buffers, by their keys in Playground's configuration.
+
+    That for contacts is for all worlds; theirs is for as many as they train with.
+    """
     suites = ("locomotion", "manipulation", "dm_control_suite")
-    suite = next((one for one in suites if name in getattr(registry, one).ALL_ENVS), None)
-    if max_envs is None or suite is None:
-        return 1.0
+    suite = next((one for one in suites if task in getattr(registry, one).ALL_ENVS), None)
+    if suite is None:
+        return {}
     settings = importlib.import_module(f"mujoco_playground.config.{suite}_params")
-    return max(1.0, max_envs / settings.brax_ppo_config(name).num_envs)
+    trained = settings.brax_ppo_config(task).num_envs
+    contacts, rows = config.naconmax, config.njmax
+    if (sizes := BUFFERS.get(task)) is not None:
+        contacts, rows = trained * sizes.contacts_per_env, sizes.constraints_per_env
+    growth = max(1.0, (max_envs or 0) / trained)
+    return {"naconmax": math.ceil(contacts * growth), "njmax": rows}
 
 
 def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> Env:
@@ -155,6 +196,7 @@ def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> En
         episode_length=episode_length,
         mj_model=theirs.mj_model,
         qpos=lambda state: state.data.qpos,
+        with_model=lambda theirs, leaves: _with_leaves(theirs, dict(leaves)),
     )
     return _with_overflow(env) if is_warp else env
 
