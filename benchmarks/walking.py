@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import shutil
 import statistics
 import sys
 import tempfile
@@ -77,8 +78,12 @@ class Benchmark:
             variables |= variables_of_brax("playground")
         started_s = time.time()
         code = run_command(command, self._deadline_s, variables)
+        command_s = time.time() - started_s
         checkpoints = _ours(folder, started_s) if trainer == OURS else _theirs(folder, started_s)
-        return {"code": code, "command_s": time.time() - started_s, "checkpoints": checkpoints}
+        for one in checkpoints:  # Environments take hundreds of MB; only policies are tested.
+            for environments in Path(one["folder"]).glob("gmi_*"):
+                shutil.rmtree(environments)
+        return {"code": code, "command_s": command_s, "checkpoints": checkpoints}
 
     def _our_command(self, folder: Path, seed: str, *, is_short: bool) -> list[str]:
         config = self._config
@@ -218,7 +223,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--cold", action="store_true", help="compile in every training")
     parser.add_argument("--script", help="train with Playground's script too, with these flags")
     parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
-    parser.add_argument("--runs", type=Path, help="keep the trainings in this new folder")
+    parser.add_argument("--runs", type=Path, help="keep the trainings here, without environments")
     return parser.parse_intermixed_args()
 
 

@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.evaluation import walking_tables
+from benchmarks.evaluation.figures import NOT_MEASURED
+from benchmarks.records import ResultsFile
 from benchmarks.walking import _theirs, summary, walks_from
 from benchmarks.walking_tests import policy_of, walks_twice
 from gmijax.player.policy import PlainPolicy, write_policy
@@ -133,3 +136,21 @@ def test_a_policy_of_brax_gets_its_observations_by_name(tmp_path):
     assert whose == "brax"
     acted = jax.jit(found.act)(found.weights, obs)
     assert np.asarray(acted) == pytest.approx(np.asarray(act(named, key)[0]), abs=1e-6)
+
+
+def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypatch):
+    monkeypatch.setattr(walking_tables, "RESULTS", tmp_path)
+    assert walking_tables.walking() == [NOT_MEASURED]
+    row = {"seeds": 5, "walk": 5, "env_steps": [4e7, 5e7, 6e7]}
+    for is_cold, seconds in ((False, 99.0), (False, 60.0), (True, 100.0)):
+        path = tmp_path / "walking-go1-nvidia-h100.json"
+        file = ResultsFile(path, "walking", {"cold": is_cold}, device="H100")
+        spread = {"training_s": [50.0, seconds, 120.0], "command_s": None}
+        with file.changing() as results:
+            results.update(task="go1", rows={"gmijax": row | spread})
+    lines = walking_tables.walking()
+    rows = [line for line in lines if line.startswith("| `go1`")]
+    assert rows == [
+        "| `go1` | gmijax | from the cache | 5 of 5 | 50 (40 to 60) | 60 (50 to 120) |  |",
+        "| `go1` | gmijax | compiled anew | 5 of 5 | 50 (40 to 60) | 100 (50 to 120) |  |",
+    ]
