@@ -34,6 +34,7 @@ from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
+from gmijax.player.joystick import robot_of
 from gmijax.player.walking import lines_of
 from gmijax.runs.folder import (
     META,
@@ -170,6 +171,10 @@ def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
     config, env, changed = open_run(config)
     if config.randomize == "on" and not draws_models(env):
         raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
+    if config.walking_envs and robot_of(env) is None:
+        raise ConfigError(
+            f"walking_envs={config.walking_envs}: {env.label} has no walking test; allowed are 0, null"
+        )
     return config, changed
 
 
