@@ -173,7 +173,8 @@ def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
         raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
     if config.walking_envs and robot_of(env) is None:
         raise ConfigError(
-            f"walking_envs={config.walking_envs}: {env.label} has no walking test; allowed are 0, null"
+            f"walking_envs={config.walking_envs}: {env.label} has no walking test; "
+            "allowed are 0, null"
         )
     return config, changed
 
