@@ -91,6 +91,14 @@ def test_go1_starts_and_steps(walked: Walked) -> None:
     assert ((height > 0.2) & (height < 0.4)).all(), "it stands"
 
 
+def test_films_know_the_command_that_the_policy_sees(walked: Walked) -> None:
+    state = walked.states[-1].env
+    assert walked.env.command is not None
+    command = np.asarray(jax.vmap(walked.env.command)(state))
+    assert np.abs(command).max() > 0.1
+    np.testing.assert_allclose(command, state.obs[:, 45:48])
+
+
 def test_each_world_has_the_model_that_playground_draws(walked: Walked) -> None:
     start, end = (
         np.asarray(jax.vmap(walked.env.qpos)(state.env))
@@ -116,15 +124,16 @@ def test_several_gmis_have_the_worlds_of_one(walked: Walked) -> None:
 def test_a_policy_for_go1_is_exported(walked: Walked, tmp_path: Path) -> None:
     sizes = {"obs_size": 171, "action_size": 12, "actor_obs_size": 48}
     run = make_run(tmp_path / "run", "env=go1", "tuned=go1_ppo", **sizes)
-    policy = trained_policy(run.checkpoint(ENV_STEPS))
     about = names_of(walked.env)
     assert about["action_names"][:3] == ["FR_hip", "FR_thigh", "FR_calf"]
     assert about["joint_names"][1:3] == ["FR_hip_joint", "FR_thigh_joint"]
     assert about["control_dt_s"] == 0.02
     file = tmp_path / "policy.stablehlo"
-    file.write_bytes(stablehlo_content(policy))
+    file.write_bytes(stablehlo_content(trained_policy(run.checkpoint(ENV_STEPS))))
     obs = np.random.default_rng(0).normal(size=(3, 48)).astype(np.float32)
-    np.testing.assert_allclose(gmijax.load_policy(file)(obs), policy(obs), atol=1e-6)
+    np.testing.assert_allclose(
+        gmijax.load_policy(file)(obs), gmijax.load_policy(run.root)(obs), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("name", ROBOTS)

@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gmijax.config.env import label_of
+from gmijax.config.env import ROBOTS, label_of
 from gmijax.config.schema import flatten, suggestion
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters.brax_interface import adapt
@@ -74,6 +74,8 @@ def make(
     if has_randomizer(task):
         draw = partial(_drawn, theirs, registry.get_domain_randomizer(task))
         env = env._replace(draw_models=draw)
+    if task in ROBOTS.values():
+        env = env._replace(command=lambda state: state.task.info["command"])
     return env._replace(max_envs=max_envs) if env.overflow is not None else env
 
 
@@ -81,7 +83,8 @@ def import_playground() -> Any:
     """The package `mujoco_playground`, which finds models as `robot_models` does."""
     # By name: it is not installed where gmijax is checked.
     package = attempt("env=playground", importlib.import_module, "mujoco_playground")
-    importlib.import_module("mujoco_playground._src.mjx_env").MENAGERIE_PATH = _Models()
+    base: Any = importlib.import_module("mujoco_playground._src.mjx_env")
+    base.MENAGERIE_PATH = _Models()
     return package
 
 
