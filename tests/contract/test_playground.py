@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -149,6 +150,24 @@ def test_what_is_written_here_is_what_playground_has(name: str) -> None:
     changed = ROBOT_SETTINGS[name](**least).overrides()
     config.lock().update_from_flattened_dict(changed)
     assert not any(np.any(flatten(config.to_dict())[key]) for key in changed if "scale" not in key)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_tuned_settings_are_those_that_playground_ships(name: str) -> None:
+    params = importlib.import_module("mujoco_playground.config.locomotion_params")
+    wanted, config = params.brax_ppo_config(ROBOTS[name]), gmijax.compose(f"env={name}")
+    algo: Any = config.algo
+    same = ("num_minibatches", "num_updates_per_batch", "discounting", "learning_rate")
+    for key in (*same, "entropy_cost", "max_grad_norm", "reward_scaling"):
+        assert getattr(algo, key) == pytest.approx(wanted[key]), key
+    assert (config.num_envs, config.num_timesteps) == (wanted.num_envs, wanted.num_timesteps)
+    assert algo.clipping_epsilon == wanted.get("clipping_epsilon", 0.3)
+    collected = wanted.unroll_length * wanted.batch_size * wanted.num_minibatches
+    assert algo.unroll_length * config.num_envs == collected
+    networks = wanted.network_factory
+    assert algo.policy_hidden_layer_sizes == networks.policy_hidden_layer_sizes
+    assert algo.value_hidden_layer_sizes == networks.value_hidden_layer_sizes
+    assert (algo.value_obs_key == "state") == (networks.value_obs_key == "state")
 
 
 def test_models_and_randomisers_are_known_for_every_task() -> None:

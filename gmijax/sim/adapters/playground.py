@@ -113,11 +113,14 @@ def _by_name(tree: PyTree) -> dict[str, Any]:
 
 
 @contextmanager
-def _with_leaves(theirs: Any, leaves: Mapping[str, Array]) -> Iterator[None]:
+def _with_leaves(theirs: Any, leaves: Mapping[str, Array] | tuple[()]) -> Iterator[None]:
     """Within it the model of `theirs` has these leaves, drawn for one world.
 
     As in Playground's own wrapper. A tracer that stayed there would break what is traced next.
     """
+    if not leaves:
+        yield
+        return
     nominal = theirs.mjx_model
     theirs._mjx_model = nominal.tree_replace(dict(leaves))
     try:
@@ -191,7 +194,7 @@ def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> En
         episode_length=episode_length,
         mj_model=theirs.mj_model,
         qpos=lambda state: state.data.qpos,
-        with_model=lambda theirs, leaves: _with_leaves(theirs, dict(leaves)),
+        with_model=_with_leaves,
     )
     return _with_overflow(env) if is_warp else env
 
