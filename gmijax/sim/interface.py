@@ -98,6 +98,8 @@ class Env(NamedTuple):
         earlier.
       draw_models: `keys [N] -> model`, domain randomisation that the task brings itself: all
         leaves have an axis [N]. None if it brings none.
+      command: `EnvState -> [3]`, the velocity that a robot is commanded, for films: m/s forwards
+        and to the left, rad/s to the left. None if there is none.
     """
 
     spec: EnvSpec
@@ -111,3 +113,4 @@ class Env(NamedTuple):
     model_axes: PyTree = None
     next_episode: Callable[[PyTree, EnvState], EnvState] | None = None
     draw_models: Callable[[PRNGKey], PyTree] | None = None
+    command: Callable[[EnvState], Array] | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -96,6 +97,14 @@ def test_go1_starts_and_steps(walked: Walked) -> None:
     assert ((height > 0.2) & (height < 0.4)).all(), "it stands"
 
 
+def test_films_know_the_command_that_the_policy_sees(walked: Walked) -> None:
+    state = walked.states[-1].env
+    assert walked.env.command is not None
+    command = np.asarray(jax.vmap(walked.env.command)(state))
+    assert np.abs(command).max() > 0.1
+    np.testing.assert_allclose(command, state.obs[:, 45:48])
+
+
 def test_each_world_has_the_model_that_playground_draws(walked: Walked) -> None:
     start, end = (
         np.asarray(jax.vmap(walked.env.qpos)(state.env))
@@ -141,15 +150,16 @@ def test_the_walking_test_reads_what_playground_rewards(walked: Walked) -> None:
 def test_a_policy_for_go1_is_exported(walked: Walked, tmp_path: Path) -> None:
     sizes = {"obs_size": 171, "action_size": 12, "actor_obs_size": 48}
     run = make_run(tmp_path / "run", "env=go1", "tuned=go1_ppo", **sizes)
-    policy = trained_policy(run.checkpoint(ENV_STEPS))
     about = names_of(walked.env)
     assert about["action_names"][:3] == ["FR_hip", "FR_thigh", "FR_calf"]
     assert about["joint_names"][1:3] == ["FR_hip_joint", "FR_thigh_joint"]
     assert about["control_dt_s"] == 0.02
     file = tmp_path / "policy.stablehlo"
-    file.write_bytes(stablehlo_content(policy))
+    file.write_bytes(stablehlo_content(trained_policy(run.checkpoint(ENV_STEPS))))
     obs = np.random.default_rng(0).normal(size=(3, 48)).astype(np.float32)
-    np.testing.assert_allclose(gmijax.load_policy(file)(obs), policy(obs), atol=1e-6)
+    np.testing.assert_allclose(
+        gmijax.load_policy(file)(obs), gmijax.load_policy(run.root)(obs), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -165,6 +175,24 @@ def test_what_is_written_here_is_what_playground_has(name: str) -> None:
     changed = ROBOT_SETTINGS[name](**least).overrides()
     config.lock().update_from_flattened_dict(changed)
     assert not any(np.any(flatten(config.to_dict())[key]) for key in changed if "scale" not in key)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_tuned_settings_are_those_that_playground_ships(name: str) -> None:
+    params = importlib.import_module("mujoco_playground.config.locomotion_params")
+    wanted, config = params.brax_ppo_config(ROBOTS[name]), gmijax.compose(f"env={name}")
+    algo: Any = config.algo
+    same = ("num_minibatches", "num_updates_per_batch", "discounting", "learning_rate")
+    for key in (*same, "entropy_cost", "max_grad_norm", "reward_scaling"):
+        assert getattr(algo, key) == pytest.approx(wanted[key]), key
+    assert (config.num_envs, config.num_timesteps) == (wanted.num_envs, wanted.num_timesteps)
+    assert algo.clipping_epsilon == wanted.get("clipping_epsilon", 0.3)
+    collected = wanted.unroll_length * wanted.batch_size * wanted.num_minibatches
+    assert algo.unroll_length * config.num_envs == collected
+    networks = wanted.network_factory
+    assert algo.policy_hidden_layer_sizes == networks.policy_hidden_layer_sizes
+    assert algo.value_hidden_layer_sizes == networks.value_hidden_layer_sizes
+    assert (algo.value_obs_key == "state") == (networks.value_obs_key == "state")
 
 
 def test_models_and_randomisers_are_known_for_every_task() -> None:

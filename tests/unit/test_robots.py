@@ -15,6 +15,7 @@ from made_checkpoint import make_run
 import gmijax
 from gmijax.cli.groups import choices
 from gmijax.config.env import ROBOTS
+from gmijax.control.features import features
 from gmijax.errors import ConfigError
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import draws_models, require_env
@@ -165,6 +166,22 @@ def test_a_model_is_looked_for_where_menagerie_root_says(
     # These models are not meshes alone, and not of this robot.
     assert models_of("PandaRobotiqPushCube") == ("franka_emika_panda", "robotiq_2f85_v4")
     assert models_of("CheetahRun") == ()
+
+
+def test_the_doctor_knows_which_models_are_missing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
+    for name in ("boston_dynamics_spot", "unitree_g1", "unitree_go1"):
+        make_model(tmp_path, name)
+    [found] = [feature for feature in features({}, None) if feature.name == "robot models"]
+    assert found[1:] == (
+        False,
+        f"MENAGERIE_ROOT={tmp_path} has no model booster_t1 (docs/tasks.md)",
+    )
+    make_model(tmp_path, "booster_t1")
+    [found] = [feature for feature in features({}, None) if feature.name == "robot models"]
+    assert found.usable
 
 
 def test_a_run_of_a_robot_goes_on_as_one(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gmijax.config.env import label_of
+from gmijax.config.env import ROBOTS, label_of
 from gmijax.config.schema import flatten, suggestion
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters.brax_interface import adapt
@@ -74,6 +74,8 @@ def make(
     if has_randomizer(task):
         draw = partial(_drawn, theirs, registry.get_domain_randomizer(task))
         env = env._replace(draw_models=draw)
+    if task in ROBOTS.values():
+        env = env._replace(command=lambda state: state.task.info["command"])
     return env._replace(max_envs=max_envs) if env.overflow is not None else env
 
 
@@ -89,7 +91,8 @@ def import_playground() -> Any:
     """The package `mujoco_playground`, which finds models as `robot_models` does."""
     # By name: it is not installed where gmijax is checked.
     package = attempt("env=playground", importlib.import_module, "mujoco_playground")
-    importlib.import_module("mujoco_playground._src.mjx_env").MENAGERIE_PATH = _Models()
+    base: Any = importlib.import_module("mujoco_playground._src.mjx_env")
+    base.MENAGERIE_PATH = _Models()
     return package
 
 
@@ -118,11 +121,14 @@ def _by_name(tree: PyTree) -> dict[str, Any]:
 
 
 @contextmanager
-def _with_leaves(theirs: Any, leaves: Mapping[str, Array]) -> Iterator[None]:
+def _with_leaves(theirs: Any, leaves: Mapping[str, Array] | tuple[()]) -> Iterator[None]:
     """Within it the model of `theirs` has these leaves, drawn for one world.
 
     As in Playground's own wrapper. A tracer that stayed there would break what is traced next.
     """
+    if not leaves:
+        yield
+        return
     nominal = theirs.mjx_model
     theirs._mjx_model = nominal.tree_replace(dict(leaves))
     try:
@@ -196,7 +202,7 @@ def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> En
         episode_length=episode_length,
         mj_model=theirs.mj_model,
         qpos=lambda state: state.data.qpos,
-        with_model=lambda theirs, leaves: _with_leaves(theirs, dict(leaves)),
+        with_model=_with_leaves,
     )
     return _with_overflow(env) if is_warp else env
 
