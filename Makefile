@@ -40,6 +40,8 @@ $(READY): pyproject.toml
 	  { echo "PYTHON=$(PYTHON): gmijax needs Python 3.11 or newer" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'
+	# Its tests run in MJX-JAX, and it asks for warp-lang (149 MB). The extra `test` has the rest.
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'playground>=0.2,<0.3'
 	@touch $@
 
 train: $(READY)  ## a short training run with two GMIs on whatever this machine has

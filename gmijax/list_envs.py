@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 from rich.table import Table
 
+from gmijax.config.env import ROBOTS
 from gmijax.control.console import open_console, print_next
 from gmijax.control.exit_codes import EXIT_OK, exit_code_of
 from gmijax.errors import ConfigError
@@ -84,7 +85,7 @@ def task_of(name: str) -> Task:
 
 def suite_lines() -> list[str]:
     """A line for each suite of others: how a task of it is named, or what must be installed."""
-    lines = []
+    lines = [f"env={', env='.join(ROBOTS)}: robots of MuJoCo Playground (docs/tasks.md)"]
     for suite in SUITES:
         try:
             require_task("", suite)

@@ -7,6 +7,7 @@ from benchmarks.evaluation import (  # noqa: F401  Each registers its tables.
     front,
     learning_tables,
     seed_tables,
+    walking_tables,
 )
 from benchmarks.evaluation.async_tables import asynchronous_gains
 from benchmarks.evaluation.figures import bounds, shown

@@ -24,7 +24,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from benchmarks.peers.comparisons import BraxTraining
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import read_json, write_json
-from gmijax.sim.adapters.playground import without_warnings
+from gmijax.sim.adapters.playground import import_playground, without_warnings
 from gmijax.sim.registry import make_env
 from gmijax.types import PyTree
 
@@ -91,7 +91,7 @@ def environment(training: BraxTraining) -> tuple[Any, dict[str, Any]]:
             "episode_length": length or 1000
         }
     if training.suite == "playground":
-        playground = importlib.import_module("mujoco_playground")
+        playground = import_playground()
         env = playground.registry.load(training.env, config_overrides={"impl": training.impl})
         if training.impl == "warp":
             env = without_warnings(env)

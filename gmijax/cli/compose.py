@@ -16,8 +16,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gmijax.cli.arguments import parse, readable, require_text
 from gmijax.cli.groups import choices, config_dir
-from gmijax.cli.saved import as_the_run_was, copy_key, with_saved
+from gmijax.cli.saved import NAMED_BY_TASK, as_the_run_was, copy_key, with_saved
 from gmijax.config import EnvConfig, ServeConfig, TrainConfig
+from gmijax.config.env import choice_of
 from gmijax.config.removed import require_not_removed
 from gmijax.config.schema import flatten, from_dict, known, require_between, suggestion
 from gmijax.errors import ConfigError
@@ -32,9 +33,6 @@ _COMPOSED: Mapping[str, type[Any]] = {
     "search": TrainConfig,
     "serve": ServeConfig,
 }
-
-_NAMED_BY_TASK = ("env.rewards.", "env.settings.")
-"""Groups of keys whose names are the task's; those of a custom task only its file knows."""
 
 _MOST_STEPS = 900 * 10**9
 
@@ -135,8 +133,8 @@ def _choices_of_run(name: str, items: Sequence[Override]) -> list[str]:
     if run in ("null", "None", "", "auto"):
         return []
     saved = saved_config_of(run, key)
-    suite = saved["env"].get("suite", "gmijax")
-    chosen = {"env": saved["env"].get("name") if suite == "gmijax" else suite}
+    suite, task = saved["env"].get("suite", "gmijax"), saved["env"].get("name")
+    chosen = {"env": choice_of(str(suite), str(task))}
     if name == "train":
         chosen["algo"] = saved["algo"].get("name", "ppo")
     return [
@@ -152,10 +150,8 @@ def compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     for item in items:
         _check_override(name, item)
     chosen = {item.key_or_group: str(item.value()) for item in items}
-    if chosen.get("env") == "custom":
-        overrides = [
-            f"++{text}" if text.startswith(_NAMED_BY_TASK) else text for text in overrides
-        ]
+    if chosen.get("env") in ("custom", "playground"):
+        overrides = [f"++{text}" if text.startswith(NAMED_BY_TASK) else text for text in overrides]
     try:
         with initialize_config_dir(str(config_dir()), version_base=None):
             config = hydra_compose(name, overrides=list(overrides))
@@ -165,7 +161,11 @@ def compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
         raise _refused(name, error, items, groups) from None
     except OSError as error:  # Hydra looks for a file with the name of the key.
         raise ConfigError(f"{max(overrides, key=len, default=name)}: {error.strerror}") from None
-    return typing.cast("dict[str, Any]", data)
+    composed = typing.cast("dict[str, Any]", data)
+    if chosen.get("env") == "playground" and isinstance(composed["env"].get("settings"), dict):
+        # Its configurations have groups, whose names stand in ours with dots.
+        composed["env"]["settings"] = flatten(composed["env"]["settings"])
+    return composed
 
 
 def _check_override(name: str, item: Override) -> None:
@@ -204,7 +204,7 @@ def _check_task_key(items: Sequence[Override]) -> None:
 
 def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
     group, dot, name = key.rpartition(".")
-    if group + dot in _NAMED_BY_TASK:
+    if group + dot in NAMED_BY_TASK:
         names = [one.removeprefix(group + dot) for one in known if one.startswith(group + dot)]
         none = f": this task has none in {group}"
         return ConfigError(f"unknown key {key}{suggestion(name, names) if names else none}")

@@ -13,6 +13,10 @@ from gmijax.config.schema import flatten
 from gmijax.runs.folder import RunPaths, given_run
 from gmijax.runs.saved_config import require_known_keys, saved_config
 
+NAMED_BY_TASK: Final = ("env.rewards.", "env.settings.")
+"""Groups of keys whose names, which may have dots, are the task's; those of tasks of others only
+these know."""
+
 _OF_THE_COMMAND: Final = (
     *("run.dir", "run.name", "run.resume", "run.profile"),
     *("env.suite", "env.name", "env.source_sha256", "algo.name"),
@@ -93,7 +97,7 @@ def _merged(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
 
 def copy_key(key: str, source: dict[str, Any], target: dict[str, Any]) -> bool:
     """Copies the value or group of a dotted key; returns whether `source` has it."""
-    *groups, last = key.split(".")
+    *groups, last = key.split(".", 2 if key.startswith(NAMED_BY_TASK) else -1)
     for group in groups:
         source, target = source.get(group, {}), target.get(group, {})
         if not (isinstance(source, dict) and isinstance(target, dict)):

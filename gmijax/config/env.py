@@ -16,6 +16,19 @@ _EXAMPLES: Mapping[str, str] = MappingProxyType(
     {"brax": "ant", "playground": "CartpoleBalance", "custom": "path/to/cart.py:make"}
 )
 
+ROBOTS: Mapping[str, str] = MappingProxyType(
+    {
+        "go1": "Go1JoystickFlatTerrain",
+        "go1_rough": "Go1JoystickRoughTerrain",
+        "g1": "G1JoystickFlatTerrain",
+        "g1_rough": "G1JoystickRoughTerrain",
+        "t1": "T1JoystickFlatTerrain",
+        "t1_rough": "T1JoystickRoughTerrain",
+        "spot": "SpotFlatTerrainJoystick",
+    }
+)
+"""Names of ours for tasks of MuJoCo Playground in which a robot follows a command, and theirs."""
+
 RANDOMIZED_LEAVES: Mapping[str, str] = MappingProxyType(
     {
         "body_mass": "bodies",
@@ -71,8 +84,8 @@ class EnvConfig(KeyGroup):
     # Whose task it is: env= sets it.
     suite: Literal["gmijax", "brax", "playground", "custom"] = "gmijax"
     name: str | None = doc(
-        "name of the task; with env=brax or env=playground one of theirs (Playground downloads "
-        "robot models at first use), with env=custom PATH.py:FUNCTION"
+        "name of the task; with env=brax or env=playground one of theirs, with env=custom "
+        "PATH.py:FUNCTION"
     )
     episode_length: int | None = doc(
         "steps of the task after which an episode is truncated (time limit); null: its own", low=1
@@ -118,17 +131,16 @@ class EnvConfig(KeyGroup):
             )
         for leaf, drawn in self.randomization.items():
             drawn.check(leaf)
-        if self.randomize != "off" and not self.randomization:
+        # Tasks of Playground bring what they draw.
+        if self.randomize != "off" and not self.randomization and self.suite != "playground":
             raise ConfigError(
                 f"env.randomize={self.randomize}: env.randomization names nothing to draw"
             )
 
     @property
     def label(self) -> str:
-        """Name of the task in files and messages: `ant`, `brax/ant`, `cart.py:make`."""
-        if self.suite == "custom":
-            return PurePath(str(self.name)).name
-        return str(self.name) if self.suite == "gmijax" else f"{self.suite}/{self.name}"
+        """Name of the task in files and messages: `ant`, `go1`, `brax/ant`, `cart.py:make`."""
+        return label_of(self.suite, str(self.name))
 
     @property
     def slug(self) -> str:
@@ -136,6 +148,19 @@ class EnvConfig(KeyGroup):
         if self.suite == "custom":
             return PurePath(self.label.rpartition(":")[0]).stem
         return self.label.replace("/", "-")
+
+
+def label_of(suite: str, name: str) -> str:
+    """See `EnvConfig.label`."""
+    if suite == "custom":
+        return PurePath(name).name
+    return name if choice_of(suite, name) == name else f"{suite}/{name}"
+
+
+def choice_of(suite: str, name: str) -> str:
+    """What `env=` chooses a task by: `ant`, `go1`; `brax`, with `env.name` beside it."""
+    is_ours = suite == "gmijax" or (suite == "playground" and name in ROBOTS)
+    return name if is_ours else suite
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -54,6 +54,12 @@ class PlayConfig(KeyGroup):
     max_steps: int | None = doc(
         "cut episodes off after this many steps; null: only the task does", low=1
     )
+    walking_envs: int | None = doc(
+        "environments of the walking test, which the robots go1, g1, t1 and spot have "
+        "(docs/walking.md); 0: no test; null: 1000, or none where there is no GPU",
+        default=None,
+        low=0,
+    )
     video: Literal["auto", "mp4", "gif", "both", "none"] = doc(
         "what to film; auto: mp4, or nothing where there is no headless OpenGL"
     )

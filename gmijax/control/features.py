@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
-import shutil
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
+from gmijax.config.env import ROBOTS
 from gmijax.machine.opengl import first_opengl, opengls, what_is_missing
+from gmijax.sim.robot_models import find_model, how_to_get, models_of
 
 OPENGL_TIMEOUT_S: Final = 60.0
 """Longest wait for a picture."""
@@ -61,14 +61,6 @@ def find_opengl_here() -> OpenGl:
     return OpenGl(None, f"{what_is_missing(tried)}; the last one: {said}")
 
 
-def menagerie() -> Path | None:
-    """Where Playground keeps its robot models; None without Playground."""
-    spec = importlib.util.find_spec("mujoco_playground")
-    if spec is None or spec.origin is None:
-        return None
-    return Path(spec.origin).parent / "external_deps" / "mujoco_menagerie"
-
-
 def features(versions: Mapping[str, str | None], opengl: OpenGl | None) -> Iterator[Feature]:
     """What works here.
 
@@ -83,14 +75,14 @@ def features(versions: Mapping[str, str | None], opengl: OpenGl | None) -> Itera
         missing = [package for package in extra.packages if not versions.get(package)]
         why = f"{extra.brings}: pip install {extra.install}" if missing else extra.brings
         yield Feature(name, not missing, why)
-    if (folder := menagerie()) is not None:
-        yield _robot_models(folder)
+    if importlib.util.find_spec("mujoco_playground") is not None:
+        yield _robot_models()
 
 
-def _robot_models(folder: Path) -> Feature:
-    """Those of Playground, which it clones when a task first needs them."""
-    if folder.is_dir():
-        return Feature("robot models", True, "of env=playground, downloaded")
-    if shutil.which("git") is None:
-        return Feature("robot models", False, "env=playground downloads them: apt-get install git")
-    return Feature("robot models", True, "of env=playground, downloaded when first needed")
+def _robot_models() -> Feature:
+    """Those of `env=go1` and others; tasks of Playground that need none run without them."""
+    names = sorted({name for task in ROBOTS.values() for name in models_of(task)})
+    missing = [name for name in names if find_model(name) is None]
+    return Feature(
+        "robot models", not missing, how_to_get(missing) if missing else "of env=go1, ..."
+    )

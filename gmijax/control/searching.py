@@ -52,8 +52,8 @@ def search(config: TrainConfig, *, show: Show = False) -> SearchResult:
 def _training(config: TrainConfig, result: SearchResult) -> str:
     """The command that trains with what was found, beside what else was given."""
     env = config.env
-    task = f"env={shlex.quote(str(env.name if env.suite == 'gmijax' else env.label))}"
-    if env.suite in ("brax", "playground"):
+    task = f"env={shlex.quote(env.label)}"
+    if env.label == f"{env.suite}/{env.name}":
         task = f"env={env.suite} env.name={env.name}"
     gpus = "" if config.plan.gpus == 1 else f" plan.gpus={config.plan.num_gpus}"
     return (

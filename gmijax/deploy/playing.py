@@ -34,6 +34,8 @@ from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
+from gmijax.player.joystick import robot_of
+from gmijax.player.walking import lines_of
 from gmijax.runs.folder import (
     META,
     PlayPaths,
@@ -53,7 +55,7 @@ from gmijax.runs.resume import (
 )
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
-from gmijax.sim.registry import require_env
+from gmijax.sim.registry import draws_models, require_env
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.run_gmis import Launch, run_gmis
 from gmijax.viewer.installed import INSTALL, missing
@@ -108,6 +110,8 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     console.print(returns_table(returns))
     if config.checkpoint != SHIPPED and (note := _return_while_training(config, returns)):
         console.print(note)
+    if "walking" in returns:
+        console.print(_walking(config, returns["walking"]))
     console.print(f"returns: {nearby(paths.returns)}")
     if not paths.model.exists():
         without_film(config, returns["env"], console)
@@ -122,6 +126,14 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
         # With its textures a robot takes 100 MB, for every checkpoint that is played.
         paths.model.unlink(missing_ok=True)
     print_next(console, *_next_steps(config))
+
+
+def _walking(config: PlayConfig, walk: Mapping[str, Any] | None) -> str:
+    if walk is not None:
+        return "\n".join(lines_of(walk))
+    if config.walking_envs == 0:
+        return "no walking test: walking_envs=0"
+    return "no walking test without a GPU, unless it is asked for: walking_envs=8 takes minutes"
 
 
 def _return_while_training(config: PlayConfig, returns: Mapping[str, Any]) -> str | None:
@@ -157,8 +169,13 @@ def _require_page(config: PlayConfig) -> None:
 def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
     """As `open_run`, with what only playing asks for checked too."""
     config, env, changed = open_run(config)
-    if config.randomize == "on" and not env.randomization:
+    if config.randomize == "on" and not draws_models(env):
         raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
+    if config.walking_envs and robot_of(env) is None:
+        raise ConfigError(
+            f"walking_envs={config.walking_envs}: {env.label} has no walking test; "
+            "allowed are 0, null"
+        )
     return config, changed
 
 

@@ -33,6 +33,7 @@ def checked(config: PlayConfig) -> PlayConfig:
         ("deterministic", config.deterministic, True),
         ("randomize", config.randomize, "off"),
         ("physics.impl", config.physics.impl, "auto"),
+        ("walking_envs", config.walking_envs or None, None),
     ):
         if value != allowed:
             shown = "null" if allowed is None else str(allowed).lower()

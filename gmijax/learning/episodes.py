@@ -208,4 +208,9 @@ def _is_running(state: EnvState, limit: Array | int) -> Array:
 
 
 def _shown_qpos(env: Env, state: EnvState, num_shown: int) -> Array:
-    return jax.vmap(env.qpos)(jax.tree.map(lambda leaf: leaf[:num_shown], state))
+    """Positions [E, ...] as a `Trajectory` has them."""
+    shown = jax.tree.map(lambda leaf: leaf[:num_shown], state)
+    qpos = jax.vmap(env.qpos)(shown)
+    if env.command is None:
+        return qpos
+    return jnp.concatenate([qpos, jax.vmap(env.command)(shown)], axis=-1)

@@ -18,6 +18,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.arrays import array_module
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import POLICY, open_regular, write_bytes
 
@@ -59,20 +60,22 @@ class PlainPolicy:
         """O, how many numbers of an observation the policy sees."""
         return len(self.obs_mean)
 
-    def __call__(self, obs: npt.ArrayLike) -> Floats:
+    def __call__(self, obs: npt.ArrayLike) -> Any:
         """Actions [..., A] in [-1, 1] for raw observations [..., O], or longer ones.
 
-        Of longer ones the first O numbers are seen: the others are for a value function.
+        Of longer ones the first O numbers are seen: the others are for a value function. Arrays
+        of JAX give arrays of JAX.
         """
-        seen = np.asarray(obs, np.float32)[..., : self.obs_size]
+        xp = array_module(obs) if hasattr(obs, "shape") else np
+        seen = xp.asarray(obs, np.float32)[..., : self.obs_size]
         x = (seen - self.obs_mean) / self.obs_std
         if self.obs_clip is not None:
-            x = np.clip(x, -self.obs_clip, self.obs_clip)
+            x = xp.clip(x, -self.obs_clip, self.obs_clip)
         for kernel, bias in zip(self.kernels[:-1], self.biases[:-1], strict=True):
             x = x @ kernel + bias
-            x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+            x = xp.where(x > 0, x, xp.expm1(xp.minimum(x, 0)))
         mean = (x @ self.kernels[-1] + self.biases[-1])[..., : self.action_size]
-        return np.clip(np.tanh(mean) if self.head == "tanh_normal" else mean, -1.0, 1.0)
+        return xp.clip(xp.tanh(mean) if self.head == "tanh_normal" else mean, -1.0, 1.0)
 
 
 def write_policy(path: Path, policy: PlainPolicy, *, half: bool = False) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
+from gmijax.config.env import ROBOTS
 from gmijax.errors import ConfigError
 
 Impl = Literal["jax", "warp"]
@@ -81,7 +82,7 @@ def choose_impl(
         return "jax", f"MJX-Warp is slow on {device_platform}"
     if task in ON_GPU:
         why = f"the faster one for {task} on a GPU"
-    elif task is not None and task.startswith("playground/"):
+    elif task is not None and (task in ROBOTS or task.startswith("playground/")):
         why = "what MuJoCo Playground itself chooses"
     else:
         return "jax", "not tuned for MJX-Warp; ask for it with physics.impl=warp"

@@ -96,6 +96,10 @@ class Env(NamedTuple):
         world, for tasks that carry something on in `task`, such as the level of a curriculum.
         None: `reset(model, ended.key)`. Of a world that diverged `task` is that of one step
         earlier.
+      draw_models: `keys [N] -> model`, domain randomisation that the task brings itself: all
+        leaves have an axis [N]. None if it brings none.
+      command: `EnvState -> [3]`, the velocity that a robot is commanded, for films: m/s forwards
+        and to the left, rad/s to the left. None if there is none.
     """
 
     spec: EnvSpec
@@ -108,3 +112,5 @@ class Env(NamedTuple):
     overflow: Callable[[EnvState], Array] | None = None
     model_axes: PyTree = None
     next_episode: Callable[[PyTree, EnvState], EnvState] | None = None
+    draw_models: Callable[[PRNGKey], PyTree] | None = None
+    command: Callable[[EnvState], Array] | None = None

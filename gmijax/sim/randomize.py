@@ -80,7 +80,7 @@ def randomized(
 
     Args:
       env: the task, whose model all worlds share.
-      ranges: what to draw, by leaf.
+      ranges: what to draw, by leaf; empty: what the task itself draws.
       seed: the job's seed, the same on every GMI.
       first_env: global number of this GMI's first environment.
       num_envs: N; the result is for exactly so many worlds.
@@ -91,10 +91,13 @@ def randomized(
     """
     from mujoco import mjx  # A second to import, which tasks without it need not pay.
 
-    if not isinstance(env.model, mjx.Model):
-        raise ConfigError(f"env.randomize=on: {env.spec.name} has no model of MJX to draw")
     key = jax.random.fold_in(jax.random.key(seed), _STREAM)
     keys = env_keys(key, first_env, num_envs)
+    if not ranges and env.draw_models is not None:
+        model = env.draw_models(keys)
+        return env._replace(model=model, model_axes=jax.tree.map(lambda _: 0, model))
+    if not isinstance(env.model, mjx.Model):
+        raise ConfigError(f"env.randomize=on: {env.spec.name} has no model of MJX to draw")
     leaves: Leaves = {}
     for leaf, drawn in ranges.items():
         leaves |= _with_dependents(env.mj_model, leaf, _drawn(env, keys, leaf, drawn))

@@ -12,9 +12,12 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from gmijax.config import EnvConfig
+from gmijax.config.env import ROBOTS
 from gmijax.errors import ConfigError
 from gmijax.machine.xla_on_cpu import missing_on_cpu
 from gmijax.sim import source
+from gmijax.sim.robot_models import require_models
+from gmijax.sim.robots import ROBOT_SETTINGS, has_randomizer, playground_name
 from gmijax.sim.tasks.settings import CURRICULA, SETTINGS, settings_from
 
 if TYPE_CHECKING:
@@ -33,7 +36,8 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "custom": "gmijax.sim.adapters.custom",
     }
 )
-"""Whose tasks there are beside ours -> module with `make(name, *, impl, max_envs) -> Env`."""
+"""Whose tasks there are beside ours -> module with `make(name, *, impl, max_envs) -> Env`; those
+whose tasks have them take `rewards` and `settings` too."""
 
 _PACKAGES: Mapping[str, str] = MappingProxyType(
     {"brax": "brax", "playground": "mujoco_playground"}
@@ -69,6 +73,33 @@ def require_env(env: EnvConfig) -> None:
     require_task(str(env.name), env.suite)
     has_curriculum = env.curriculum == "on"
     _require_changes(str(env.name), env.suite, env.rewards, env.settings, has_curriculum)
+    if env.suite == "playground":
+        _require_randomizer(env)
+        require_models(playground_name(str(env.name)), env.label)
+
+
+def draws_models(env: EnvConfig) -> bool:
+    """Whether there is anything that `env.randomize` could draw."""
+    brings = env.suite == "playground" and has_randomizer(playground_name(str(env.name)))
+    return bool(env.randomization) or brings
+
+
+def _require_randomizer(env: EnvConfig) -> None:
+    """Raises ConfigError for a randomisation that a task of Playground cannot have."""
+    if env.randomization:
+        raise ConfigError(
+            f"env.randomization.{next(iter(env.randomization))}: not with env={env.label}; tasks "
+            "of Playground bring what they draw, or draw nothing"
+        )
+    if env.randomize == "episode":
+        raise ConfigError(
+            f"env.randomize=episode: not with env={env.label}, whose episodes all begin with the "
+            "first start of their environment; allowed are off, on"
+        )
+    if env.randomize == "on" and not draws_models(env):
+        raise ConfigError(
+            f"env.randomize=on: Playground has no randomisation for {env.label}; allowed is off"
+        )
 
 
 def _require_changes(
@@ -86,12 +117,15 @@ def _require_changes(
         )
     if suite == "gmijax":
         settings_from(SETTINGS[name], settings)
-    elif suite in _PACKAGES:
+    elif suite == "playground" and name in ROBOTS:
+        settings_from(ROBOT_SETTINGS[name], settings)
+    elif suite == "brax":
         for group, given in (("rewards", rewards), ("settings", settings)):
             if given:
                 raise ConfigError(
-                    f"env.{group}.{next(iter(given))}: not with env={suite}, whose environments "
-                    "are taken as they are; allowed are our tasks and env=PATH.py:FUNCTION"
+                    f"env.{group}.{next(iter(given))}: not with env=brax, whose environments are "
+                    "taken as they are; allowed are our tasks, env=playground and "
+                    "env=PATH.py:FUNCTION"
                 )
 
 
@@ -143,7 +177,8 @@ def make_env(
     """Makes a task, with its time limit.
 
     Args:
-      name: one of `task_names()`, a name that `suite` knows, or `PATH.py:FUNCTION`.
+      name: one of `task_names()` or of `gmijax.config.env.ROBOTS`, a name that `suite` knows, or
+        `PATH.py:FUNCTION`.
       suite: whose task: `gmijax`, `brax`, `playground` or `custom`.
       impl: MJX implementation, `auto`, `jax` or `warp`.
       episode_length: steps after which an episode is truncated; None: the task's own.
@@ -173,6 +208,8 @@ def make_env(
         require_task("", "brax")
     if suite == "gmijax" and ".py:" in name:
         suite = "custom"
+    if suite == "gmijax" and name in ROBOTS:
+        suite = "playground"
     changes: dict[str, Any] = {"rewards": rewards, "settings": settings, "curriculum": curriculum}
     from gmijax.devices import require_32_bit
 

@@ -12,9 +12,15 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.sim.camera import choose_camera
+from gmijax.sim.camera import choose_camera, free_robot
 
 Image: TypeAlias = npt.NDArray[np.uint8]
+
+_ABOVE_M, _ARROW_M = 0.1, 0.02
+"""Height of the arrows of a command above a robot, and their thickness."""
+_M_PER_SPEED, _LEAST_SPEED = 0.5, 0.02
+"""Length of such an arrow for 1 m/s or 1 rad/s, and where it is left out."""
+_WAY, _TURN = (0.2, 0.8, 0.2, 1.0), (0.2, 0.4, 1.0, 1.0)
 
 _SHADOW_MAP = 1024
 """Pixels of its side: software OpenGL spends most of its time on larger ones."""
@@ -64,11 +70,39 @@ class Stage:
         self._renderer.close()
 
     def picture(self, qpos: npt.NDArray[Any]) -> Image:
-        """The picture [height, width, 3] of one world at `qpos`, as `Env.qpos` gives it."""
-        put(self._data, qpos)
+        """The picture [height, width, 3] of one world at `qpos`, as a `Trajectory` has it."""
+        command = put(self._data, qpos)
         self._mujoco.mj_fwdPosition(self._model, self._data)
         self._renderer.update_scene(self._data, self._view)
+        if command.size and (robot := free_robot(self._model)) is not None:
+            self._show_command(robot, command)
         return self._renderer.render()
+
+    def _show_command(self, robot: int, command: npt.NDArray[Any]) -> None:
+        """Arrows above a robot, 0.5 m for 1 m/s or 1 rad/s: where to, and upwards a left turn.
+
+        `command` [3] is in m/s forwards and to the left, and rad/s.
+        """
+        model, data = self._model, self._data
+        own = model.body_rootid[model.geom_bodyid] == model.body_rootid[robot]
+        top = data.geom_xpos[own, 2].max(initial=data.xpos[robot, 2]) + _ABOVE_M
+        start = np.array([*data.xpos[robot, :2], top])
+        ahead = data.xmat[robot].reshape(3, 3)[:2, 0]
+        forwards = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
+        left = np.array([-forwards[1], forwards[0]])
+        way = [*(command[0] * forwards + command[1] * left), 0.0]
+        self._arrow(start, np.array(way), _WAY)
+        self._arrow(start, np.array([0.0, 0.0, command[2]]), _TURN)
+
+    def _arrow(self, start: npt.NDArray[Any], speed: npt.NDArray[Any], colour: Any) -> None:
+        scene, arrow = self._renderer.scene, self._mujoco.mjtGeom.mjGEOM_ARROW
+        if scene.ngeom == scene.maxgeom or np.linalg.norm(speed) < _LEAST_SPEED:
+            return
+        geom = scene.geoms[scene.ngeom]
+        nothing = np.zeros(3)
+        self._mujoco.mjv_initGeom(geom, arrow, nothing, nothing, np.zeros(9), np.float32(colour))
+        self._mujoco.mjv_connector(geom, arrow, _ARROW_M, start, start + _M_PER_SPEED * speed)
+        scene.ngeom += 1
 
 
 def body_poses(
@@ -82,11 +116,17 @@ def body_poses(
     return data.xpos.copy(), data.xquat.copy()
 
 
-def put(data: Any, qpos: npt.NDArray[Any]) -> None:
-    """Moves the joints of a `mujoco.MjData`, and its mocap bodies if `qpos` has their poses."""
+def put(data: Any, qpos: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Moves the joints of a `mujoco.MjData`, and its mocap bodies if `qpos` has their poses.
+
+    Returns:
+      The command at the end of `qpos`, [3] or empty.
+    """
     joints, rest = np.split(np.asarray(qpos), [data.qpos.size])
     data.qpos[:] = joints
-    if rest.size:
-        pos, quat = np.split(rest, [data.mocap_pos.size])
+    poses, command = np.split(rest, [rest.size // 7 * 7])
+    if poses.size:
+        pos, quat = np.split(poses, [data.mocap_pos.size])
         data.mocap_pos[:] = pos.reshape(-1, 3)
         data.mocap_quat[:] = quat.reshape(-1, 4)
+    return command

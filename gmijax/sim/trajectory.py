@@ -20,7 +20,8 @@ class Trajectory(NamedTuple):
     """Episodes of some worlds, side by side.
 
     Attributes:
-      qpos: [L + 1, E, nq], or longer where mocap bodies move: see `Env.qpos`.
+      qpos: [L + 1, E, nq], or longer where mocap bodies move: see `Env.qpos`; at its end
+        `Env.command`, if there is one.
       lengths: [E] steps of every episode.
       control_dt_s: seconds per step.
       labels: what to write into the picture of every world.

@@ -86,7 +86,7 @@ def why_alone(job: Job) -> str | None:
         # Its states share buffers, for which a program has no axis of jobs.
         (
             config.env.suite == "playground" and config.physics.impl != "jax",
-            f"env=playground with physics.impl={config.physics.impl}",
+            f"env={config.env.label} with physics.impl={config.physics.impl}",
         ),
         (config.env.randomize != "off", f"env.randomize={config.env.randomize}"),
         (config.eval.every is not None, "eval.every"),

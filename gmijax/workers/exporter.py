@@ -7,8 +7,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gmijax.config import ExportConfig
+from gmijax.config import EnvConfig, ExportConfig
 from gmijax.config.schema import from_dict
+from gmijax.player.deployment import deployment_of
+from gmijax.player.joystick import part_sizes, robot_of
 from gmijax.runs.folder import ExportPaths, read_json, write_bytes, write_json
 from gmijax.runs.saved_config import trained_config
 from gmijax.supervise.child import ChildLink, run_gmi
@@ -31,7 +33,7 @@ def _run(link: ChildLink) -> None:
     policy = trained_policy(checkpoint)
     # Only asked for names: nothing is simulated.
     env = make_worlds(env_config, "jax", seed=0, first_env=0, num_envs=1)
-    metadata = {**policy.metadata, **names_of(env)}
+    metadata = {**policy.metadata, **names_of(env), **_robot(env_config, env, policy.obs_size)}
     paths = ExportPaths(link.run.root)
     if config.format in ("onnx", "all"):
         write_bytes(paths.onnx, onnx_content(policy, metadata))
@@ -57,6 +59,26 @@ def names_of(env: Env) -> dict[str, Any]:
         "obs_terms": list(map(list, spec.obs_terms)) if num_values == seen else None,
         "action_names": actuators if len(actuators) == spec.action_size else None,
         "joint_names": joints or None,
+    }
+
+
+def _robot(config: EnvConfig, env: Env, obs_size: int) -> dict[str, Any]:
+    """What a robot must know of its policy; nothing for another task.
+
+    Nor for a policy that sees what no robot does, as a teacher may.
+    """
+    robot = robot_of(config)
+    if robot is None:
+        return {}
+    from gmijax.sim.adapters.playground import configuration
+
+    parts = part_sizes(robot, env.spec.action_size)
+    if obs_size != config.history * sum(length for _, length in parts):
+        return {}
+    task = deployment_of(robot, env.mj_model, configuration(str(config.name), config.settings))
+    return {
+        "obs_terms": list(map(list, parts)) * config.history,
+        "robot": {**task, "history": config.history, "action_repeat": config.action_repeat},
     }
 
 

@@ -8,18 +8,21 @@ from __future__ import annotations
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gmijax.config import EnvConfig, PlayConfig
 from gmijax.config.schema import from_dict
 from gmijax.control.console import nearby
+from gmijax.player.joystick import Robot, robot_of
 from gmijax.player.outcome import Episodes, summarise
+from gmijax.player.walking import NUM_ENVS
 from gmijax.runs.folder import PlayPaths, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.runs.saved_config import trained_config
 from gmijax.supervise.child import ChildLink, run_gmi
 
 if TYPE_CHECKING:
+    from gmijax.learning.learner import Learner, TrainState
     from gmijax.sim.interface import Env
 
 
@@ -64,14 +67,42 @@ def _run(link: ChildLink) -> None:
     _write_trajectory(paths, env, episodes, config, env_steps)
     device = jax.local_devices()[0]
     camera = None if env.mj_model is None else choose_camera(env.mj_model, config.camera).name
-    about = {
+    about: dict[str, Any] = {
         "impl": impl,
         "device": f"{device.platform}: {device.device_kind}",
         "camera": camera,
     }
+    if (robot := robot_of(env_config)) is not None:
+        about["walking"] = _walk(config, env_config, robot, impl, link, learner, state)
     # Written last: whoever sees it finds the trajectory complete.
     outcome = summarise(config, env.spec.name, env_steps, episodes)
     write_json(paths.returns, {**outcome, **about})
+
+
+def _walk(
+    config: PlayConfig,
+    env_config: EnvConfig,
+    robot: Robot,
+    impl: str,
+    link: ChildLink,
+    learner: Learner,
+    state: TrainState,
+) -> dict[str, Any] | None:
+    """What the walking test found, None without one."""
+    import jax
+
+    num_envs = config.walking_envs
+    if num_envs is None:
+        num_envs = 0 if jax.default_backend() == "cpu" else NUM_ENVS
+    if num_envs == 0:
+        return None
+    from gmijax.learning.walking import WalkingTest, act_of, walking_env
+
+    link.beat("compiling", 0)
+    env = walking_env(env_config, robot, impl, num_envs)
+    test = WalkingTest(env, robot, act_of(learner), num_envs=num_envs, seed=config.seed)
+    test.compile(state)
+    return test.run(state, lambda chunks: link.beat("running", chunks)).as_json()
 
 
 def _impl(config: PlayConfig, checkpoint: Path, env_config: EnvConfig) -> str:

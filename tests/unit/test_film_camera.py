@@ -1,6 +1,9 @@
-"""Which camera a film is taken by: the robot stays in the picture."""
+"""What a film shows: the robot stays in the picture, with its command above it."""
 
 from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -8,6 +11,7 @@ import pytest
 
 from gmijax.sim.camera import choose_camera, free_robot
 from gmijax.sim.registry import TASKS, make_env
+from gmijax.sim.stage import Stage, put
 
 FREE = '<body name="{0}"><freejoint/><geom size=".3"/>{1}</body>'
 LEG = '<body name="leg"><joint name="hip"/><geom size=".1" pos="1 0 0"/>{0}</body>'
@@ -106,3 +110,25 @@ def test_a_robot_stays_in_the_middle_and_large_on_any_ground():
 @pytest.mark.parametrize("task", sorted(TASKS))
 def test_our_own_tasks_have_a_camera_for_it(task: str):
     assert choose_camera(make_env(task).mj_model, None).name == "camera track"
+
+
+def test_arrows_show_what_a_robot_is_commanded():
+    model = _model(ROBOT, HIP)
+    stage: Any = Stage.__new__(Stage)  # It has no OpenGL, which arrows do not need.
+    scene = mujoco.MjvScene(model, 8)
+    stage._mujoco, stage._model, stage._data = mujoco, model, mujoco.MjData(model)
+    stage._renderer = SimpleNamespace(scene=scene)
+    quarter = np.sqrt(0.5)
+    turned = [0.0, 0.0, 1.0, quarter, 0.0, 0.0, quarter, *np.zeros(model.nq - 7)]
+    command = put(stage._data, np.array([*turned, 1.0, 0.0, 0.4]))
+    assert command.tolist() == [1.0, 0.0, 0.4]
+    mujoco.mj_forward(model, stage._data)
+    stage._show_command(free_robot(model), command)
+    way, turn = scene.geoms[0], scene.geoms[1]
+    assert scene.ngeom == 2
+    np.testing.assert_allclose(way.mat[:, 2], [0.0, 1.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(turn.mat[:, 2], [0.0, 0.0, 1.0], atol=1e-6)
+    assert way.size[2] / turn.size[2] == pytest.approx(1.0 / 0.4)
+    assert turn.pos[2] > stage._data.geom_xpos[:, 2].max()
+    stage._show_command(free_robot(model), np.zeros(3))
+    assert scene.ngeom == 2

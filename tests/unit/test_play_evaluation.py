@@ -127,6 +127,22 @@ def test_worlds_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytes
         playing.play(config)
 
 
+def test_a_walking_test_is_refused_where_there_is_none(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    env = EnvConfig(name="ant", episode_length=None)
+    monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
+    monkeypatch.setattr(playing, "left_out", lambda checkpoint: None)
+    config = config_of(f"run.dir={run.root}", "walking_envs=8")
+    with pytest.raises(ConfigError, match="walking_envs=8: ant has no walking test"):
+        playing.play(config)
+
+
+def test_without_a_walking_test_it_is_said_why():
+    assert "walking_envs=8" in playing._walking(config_of(), None)
+    assert "walking_envs=0" in playing._walking(config_of("walking_envs=0"), None)
+
+
 def test_playing_leaves_a_gpu_to_the_job_that_trains_on_it(run: RunPaths):
     machine = Machine(gpus=(Gpu(0, "GPU-1", "some GPU", 80000, (9, 0), False),), cpu_cores=(0, 1))
     config = config_of(f"run.dir={run.root}", "num_envs=4", "video_envs=1")

@@ -23,6 +23,7 @@ DISTRIBUTIONS = {
     "hydra": "hydra-core",
     "imageio_ffmpeg": "imageio-ffmpeg",
     "mujoco.mjx": "mujoco-mjx",
+    "mujoco_menagerie": "mujoco-menagerie",
     "mujoco_playground": "playground",
     "nccl": "nccl4py",
     "orbax": "orbax-checkpoint",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -29,6 +30,10 @@ REWARD = "reward"
 """The one term of the reward: theirs come as a sum."""
 
 
+WithModel = Callable[[PyTree], AbstractContextManager[None]]
+"""Within it theirs has a model of ours."""
+
+
 class Carried(NamedTuple):
     """What a world takes from one episode to the next.
 
@@ -42,6 +47,12 @@ class Carried(NamedTuple):
     info: Any
 
 
+def no_model(theirs: Any, model: PyTree) -> AbstractContextManager[None]:
+    """They keep their model to themselves, and ours is empty."""
+    del theirs, model
+    return nullcontext()
+
+
 def adapt(
     theirs: Any,
     *,
@@ -49,6 +60,7 @@ def adapt(
     episode_length: int,
     mj_model: Any = None,
     qpos: Callable[[Any], Array] | None = None,
+    with_model: Callable[[Any, PyTree], AbstractContextManager[None]] = no_model,
 ) -> Env:
     """Makes an `Env` of theirs.
 
@@ -63,6 +75,7 @@ def adapt(
       episode_length: steps after which an episode is truncated.
       mj_model: the MuJoCo model to film it with, None for no films.
       qpos: their state -> [nq], joint positions of that model; None for no films.
+      with_model: `(theirs, model)`: within it theirs has what `model`, one of ours, says.
 
     Raises:
       ConfigError: observations that are no vectors, or a state that changes its shape.
@@ -86,27 +99,28 @@ def adapt(
     def positions(state: EnvState) -> Array:
         return jnp.zeros(0) if qpos is None else qpos(state.physics)
 
-    reset, step = partial(_reset, theirs, spec), partial(_step, theirs)
+    own = partial(with_model, theirs)
+    reset, step = partial(_reset, theirs, own, spec), partial(_step, theirs, own)
     env = Env(spec, (), reset, step, mj_model, positions)
     env = env._replace(next_episode=partial(_next_episode, spec))
     check_env(env, f"env.name={name}")
     return env
 
 
-def _reset(theirs: Any, spec: EnvSpec, model: PyTree, key: PRNGKey) -> EnvState:
-    del model  # They keep their model to themselves.
+def _reset(theirs: Any, own: WithModel, spec: EnvSpec, model: PyTree, key: PRNGKey) -> EnvState:
     key, draw = jax.random.split(key)
-    # They were written for keys that are plain integers.
-    state = jax.tree.map(jnp.asarray, theirs.reset(jax.random.key_data(draw)))
+    with own(model):
+        # They were written for keys that are plain integers.
+        state = jax.tree.map(jnp.asarray, theirs.reset(jax.random.key_data(draw)))
     first = state.replace(info={})
     return episode.begin(spec, first, Carried(first, state.info), observation(state.obs), key)
 
 
-def _step(theirs: Any, model: PyTree, state: EnvState, action: Array) -> EnvState:
-    del model
+def _step(theirs: Any, own: WithModel, model: PyTree, state: EnvState, action: Array) -> EnvState:
     before = state.physics.replace(info=state.task.info)
     mine = jax.tree.map(lambda leaf: leaf, before)  # They write into their dicts.
-    after = _alike(before, theirs.step(mine, jnp.clip(action, -1.0, 1.0)))
+    with own(model):
+        after = _alike(before, theirs.step(mine, jnp.clip(action, -1.0, 1.0)))
     done = after.done > 0
     out_of_time = done & (jnp.asarray(after.info.get("truncation", 0)) > 0)
     reward = after.reward.astype(jnp.float32)

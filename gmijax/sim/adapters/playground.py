@@ -1,7 +1,7 @@
-"""Environments of MuJoCo Playground: `env=playground env.name=CartpoleBalance`.
+"""Environments of MuJoCo Playground: `env=go1`, `env=playground env.name=CartpoleBalance`.
 
-Playground clones the robot models of MuJoCo Menagerie from GitHub when a locomotion or
-manipulation task is made for the first time. Its tasks of the dm_control suite need no network.
+Playground looks for the robot models of MuJoCo Menagerie in its own package, and clones them
+there from GitHub. Here they come from where `robot_models` finds them.
 """
 
 from __future__ import annotations
@@ -9,67 +9,185 @@ from __future__ import annotations
 import difflib
 import importlib
 import math
-import subprocess
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from gmijax.config.env import ROBOTS, label_of
+from gmijax.config.schema import flatten, suggestion
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters.brax_interface import adapt
 from gmijax.sim.adapters.checks import attempt
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.physics import which_overflowed
-from gmijax.types import Array, PyTree
+from gmijax.sim.robot_models import model_folder
+from gmijax.sim.robots import BUFFERS, ROBOT_SETTINGS, has_randomizer, playground_name
+from gmijax.sim.tasks.settings import settings_from
+from gmijax.types import Array, PRNGKey, PyTree
+
+REWARDS = "reward_config.scales."
+"""Where Playground's configurations have the weights of the reward's terms."""
 
 
-def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
-    """Makes one of Playground's environments with its default configuration.
+def make(
+    name: str,
+    *,
+    impl: str = "auto",
+    max_envs: int | None = None,
+    rewards: Mapping[str, float] | None = None,
+    settings: Mapping[str, float] | None = None,
+) -> Env:
+    """Makes one of Playground's environments.
 
     Args:
-      name: one of `mujoco_playground.registry.ALL_ENVS`.
+      name: one of `gmijax.config.env.ROBOTS` or of `mujoco_playground.registry.ALL_ENVS`.
       impl: `auto`, `jax` or `warp`.
       max_envs: most worlds at once; MJX-Warp's buffer of contacts is for so many.
+      rewards: weights of terms of the reward by name.
+      settings: numbers by name: those of `gmijax.sim.robots`, or of Playground's configuration
+        with dots between groups.
 
     Raises:
-      ConfigError: an unknown name, models that could not be downloaded, or one that
-        Playground cannot make with the installed version of MuJoCo.
+      ConfigError: an unknown name, a model that is not here, or one that Playground cannot make
+        with the installed version of MuJoCo.
     """
-    # By name: it is not installed where gmijax is checked.
-    registry = attempt("env=playground", importlib.import_module, "mujoco_playground").registry
-    if name not in registry.ALL_ENVS:
+    registry = import_playground().registry
+    task = playground_name(name)
+    if task not in registry.ALL_ENVS:
         raise ConfigError(_unknown(name, registry.ALL_ENVS))
-    config = registry.get_default_config(name)
+    config = registry.get_default_config(task)
+    label = label_of("playground", name)
+    changed = _changed(name, flatten(config.to_dict()), rewards or {}, settings or {})
     if "impl" in config:
-        config.impl, _ = choose_impl(impl, jax.default_backend(), f"playground/{name}")
-        config.naconmax = math.ceil(config.naconmax * _growth(registry, name, max_envs))
+        changed["impl"], _ = choose_impl(impl, jax.default_backend(), label)
+        changed = _buffers(registry, task, config, max_envs) | changed
     elif impl == "warp":
         raise ConfigError(f"physics.impl=warp: {name} has MJX-JAX only; allowed are auto, jax")
-    theirs = attempt(f"env.name={name}", _load, registry, name, config)
-    env = from_playground(theirs, name=f"playground/{name}", episode_length=config.episode_length)
+    theirs = attempt(f"env.name={name}", registry.load, task, config_overrides=changed)
+    env = from_playground(theirs, name=label, episode_length=config.episode_length)
+    if has_randomizer(task):
+        draw = partial(_drawn, theirs, registry.get_domain_randomizer(task))
+        env = env._replace(draw_models=draw)
+    if task in ROBOTS.values():
+        env = env._replace(command=lambda state: state.task.info["command"])
     return env._replace(max_envs=max_envs) if env.overflow is not None else env
 
 
-def _growth(registry: Any, name: str, max_envs: int | None) -> float:
-    """How much larger a buffer for all worlds must be than theirs, which is for their training."""
-    suites = ("locomotion", "manipulation", "dm_control_suite")
-    suite = next((one for one in suites if name in getattr(registry, one).ALL_ENVS), None)
-    if max_envs is None or suite is None:
-        return 1.0
-    settings = importlib.import_module(f"mujoco_playground.config.{suite}_params")
-    return max(1.0, max_envs / settings.brax_ppo_config(name).num_envs)
+def configuration(name: str, settings: Mapping[str, float]) -> dict[str, Any]:
+    """Playground's configuration of a task, with what `settings` change in it; see `make`."""
+    config = import_playground().registry.get_default_config(playground_name(name))
+    changed = _changed(name, flatten(config.to_dict()), {}, settings)
+    config.update_from_flattened_dict(changed)
+    return config.to_dict()
 
 
-def _load(registry: Any, name: str, config: Any) -> Any:
+def import_playground() -> Any:
+    """The package `mujoco_playground`, which finds models as `robot_models` does."""
+    # By name: it is not installed where gmijax is checked.
+    package = attempt("env=playground", importlib.import_module, "mujoco_playground")
+    base: Any = importlib.import_module("mujoco_playground._src.mjx_env")
+    base.MENAGERIE_PATH = _Models()
+    return package
+
+
+class _Models:
+    """Stands for Playground's folder of models: what it asks for one is looked up."""
+
+    def exists(self) -> bool:
+        """Playground clones all models if not."""
+        return True
+
+    def __truediv__(self, name: str) -> Path:
+        return model_folder(name)
+
+
+def _drawn(theirs: Any, randomize: Callable[..., Any], keys: PRNGKey) -> dict[str, Array]:
+    """The leaves of its model that Playground draws, by name: [N, ...] for `keys` [N]."""
+    model, axes = randomize(theirs.mjx_model, jax.random.key_data(keys))
+    leaves = _by_name(model)
+    return {name: leaves[name] for name in _by_name(axes)}
+
+
+def _by_name(tree: PyTree) -> dict[str, Any]:
+    """The leaves by their names, with dots between groups."""
+    named = jax.tree.leaves_with_path(tree)
+    return {jax.tree_util.keystr(at).removeprefix("."): leaf for at, leaf in named}
+
+
+@contextmanager
+def _with_leaves(theirs: Any, leaves: Mapping[str, Array] | tuple[()]) -> Iterator[None]:
+    """Within it the model of `theirs` has these leaves, drawn for one world.
+
+    As in Playground's own wrapper. A tracer that stayed there would break what is traced next.
+    """
+    if not leaves:
+        yield
+        return
+    nominal = theirs.mjx_model
+    theirs._mjx_model = nominal.tree_replace(dict(leaves))
     try:
-        return registry.load(name, config=config)
-    except (OSError, subprocess.CalledProcessError) as error:
-        raise ConfigError(
-            f"env.name={name}: Playground could not download its robot models to "
-            f"{_menagerie_folder()}: make the task once where git reaches GitHub, or copy that "
-            "folder here; the dm_control tasks need none"
-        ) from error
+        yield
+    finally:
+        theirs._mjx_model = nominal
+
+
+def _changed(
+    name: str,
+    defaults: Mapping[str, Any],
+    rewards: Mapping[str, float],
+    given: Mapping[str, float],
+) -> dict[str, Any]:
+    """What `rewards` and the `given` settings make of Playground's configuration.
+
+    All of them by its keys, with dots between groups, and in its types.
+    """
+    if name in ROBOT_SETTINGS:
+        changed = settings_from(ROBOT_SETTINGS[name], given).overrides()
+    else:
+        changed = {key: _converted(defaults, key, value) for key, value in given.items()}
+    terms = [key.removeprefix(REWARDS) for key in defaults if key.startswith(REWARDS)]
+    if unknown := [term for term in rewards if term not in terms]:
+        hint = suggestion(unknown[0], terms) if terms else ""
+        raise ConfigError(f"env.rewards.{unknown[0]}: {name} has no such term{hint}")
+    return changed | {f"{REWARDS}{term}": weight for term, weight in rewards.items()}
+
+
+def _converted(defaults: Mapping[str, Any], key: str, value: float) -> bool | int | float:
+    """A number with the type that Playground's configuration has for it."""
+    numbers = [name for name, number in defaults.items() if isinstance(number, int | float)]
+    if key not in numbers:
+        known = [name for name in numbers if not name.startswith(REWARDS)]
+        raise ConfigError(f"env.settings.{key}: no such number{suggestion(key, known)}")
+    kind = type(defaults[key])
+    if kind is bool and value not in (0.0, 1.0):
+        raise ConfigError(f"env.settings.{key}={value!r}: must be 0 or 1")
+    if kind is int and not value.is_integer():
+        raise ConfigError(f"env.settings.{key}={value!r}: must be a whole number")
+    return kind(value)
+
+
+def _buffers(registry: Any, task: str, config: Any, max_envs: int | None) -> dict[str, int]:
+    """Sizes of MJX-Warp's buffers, by their keys in Playground's configuration.
+
+    That for contacts is for all worlds; theirs is for as many as they train with.
+    """
+    suites = ("locomotion", "manipulation", "dm_control_suite")
+    suite = next((one for one in suites if task in getattr(registry, one).ALL_ENVS), None)
+    if suite is None:
+        return {}
+    settings = importlib.import_module(f"mujoco_playground.config.{suite}_params")
+    trained = settings.brax_ppo_config(task).num_envs
+    contacts, rows = config.naconmax, config.njmax
+    if (sizes := BUFFERS.get(task)) is not None:
+        contacts, rows = trained * sizes.contacts_per_env, sizes.constraints_per_env
+    growth = max(1.0, (max_envs or 0) / trained)
+    return {"naconmax": math.ceil(contacts * growth), "njmax": rows}
 
 
 def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> Env:
@@ -84,6 +202,7 @@ def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> En
         episode_length=episode_length,
         mj_model=theirs.mj_model,
         qpos=lambda state: state.data.qpos,
+        with_model=_with_leaves,
     )
     return _with_overflow(env) if is_warp else env
 
@@ -111,10 +230,6 @@ def without_warnings(theirs: Any) -> Any:
     """
     theirs._mjx_model = theirs.mjx_model.tree_replace({"opt._impl.warn_overflow": 0})
     return theirs
-
-
-def _menagerie_folder() -> str:
-    return str(importlib.import_module("mujoco_playground._src.mjx_env").MENAGERIE_PATH)
 
 
 def _unknown(name: str, names: tuple[str, ...]) -> str:

@@ -1,0 +1,231 @@
+r"""Seconds until a robot walks: `python -m benchmarks.walking env=go1 --seeds 5`.
+
+Trains with checkpoints on the way, then puts them through the walking test, so that no test costs
+training time. A training walks from the first checkpoint on of which two in a row walk, or from
+the last one. Its seconds run from the start of the command until the checkpoint is written, and
+apart from that from the first step until the policy is there. Programs are compiled before, in a
+short training; with `--cold` every training compiles all of them.
+
+    python -m benchmarks.walking env=go1 num_timesteps=60e6 --seeds 5
+    python -m benchmarks.walking env=g1 --script='--impl=warp --num_timesteps=200000000'
+
+`--script` trains with Playground's own script (Brax's PPO) too, in turn with ours, with its own
+settings but for these flags. Adds a call to `benchmarks/results/walking-<task>-<device>.json`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import shutil
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gmijax
+from benchmarks.peers.side import variables_of_brax
+from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.runner import deadline, exit_code, in_turn, options, run_command
+from gmijax.config import TrainConfig
+from gmijax.config.schema import to_dict
+from gmijax.errors import ConfigError
+from gmijax.player.joystick import robot_of
+from gmijax.player.walking import NUM_ENVS
+from gmijax.runs.folder import RunPaths, read_json, write_json
+from gmijax.runs.history import read_metrics
+from gmijax.runs.resume import CheckpointMeta, checkpoints_of
+from gmijax.sim.robots import playground_name
+
+OURS, SCRIPT = "gmijax", "train-jax-ppo"
+
+
+class Benchmark:
+    """The trainings of one call, in its file after each of them."""
+
+    def __init__(self, given: argparse.Namespace, config: TrainConfig, scratch: Path) -> None:
+        self._given, self._config, self._scratch = given, config, scratch
+        self._deadline_s = deadline(given.deadline_s)
+        path = given.out / file_name(f"walking-{config.env.slug}", device_name())
+        self.file = ResultsFile(path, "walking", vars(given))
+        self.runs: list[dict[str, Any]] = []
+
+    def run(self) -> None:
+        """Trains with all seeds, tests, and writes both down."""
+        trainers = [OURS] if self._given.script is None else [OURS, SCRIPT]
+        if not self._given.cold:
+            for trainer in trainers:
+                self._train(trainer, "compile", is_short=True)
+        for seed, trainer in in_turn(trainers, self._given.seeds, self._deadline_s):
+            self.runs.append({"trainer": trainer, "seed": seed, **self._train(trainer, str(seed))})
+            self._write()
+        self._test()
+        self._write()
+
+    def _train(self, trainer: str, name: str, *, is_short: bool = False) -> dict[str, Any]:
+        """One training as a whole command, and its checkpoints."""
+        folder = self._scratch / f"{trainer}-{name}"
+        folder.mkdir(parents=True)
+        cache = folder if self._given.cold else self._scratch
+        variables = {"JAX_COMPILATION_CACHE_DIR": str(cache / "xla")}
+        if trainer == OURS:
+            command = self._our_command(folder, name, is_short=is_short)
+        else:
+            command = self._script_command(folder, name, is_short=is_short)
+            variables |= variables_of_brax("playground")
+        started_s = time.time()
+        code = run_command(command, self._deadline_s, variables)
+        command_s = time.time() - started_s
+        checkpoints = _ours(folder, started_s) if trainer == OURS else _theirs(folder, started_s)
+        for one in checkpoints:  # Environments take hundreds of MB; only policies are tested.
+            for environments in Path(one["folder"]).glob("gmi_*"):
+                shutil.rmtree(environments)
+        return {"code": code, "command_s": command_s, "checkpoints": checkpoints}
+
+    def _our_command(self, folder: Path, seed: str, *, is_short: bool) -> list[str]:
+        config = self._config
+        assert isinstance(config.num_envs, int)
+        per_iteration = config.num_envs * getattr(config.algo, "unroll_length", 1)
+        every = max(1, config.num_timesteps // per_iteration // self._given.tests)
+        told = [
+            *("plan.gpus=1", "plan.gmis_per_gpu=1", "run.measure_throughput=false"),
+            *(f"run.checkpoint_every={every}", "run.keep_checkpoints=null"),
+            *(*self._given.overrides, f"run.dir={folder / 'run'}"),
+            "num_timesteps=1" if is_short else f"seed={seed}",
+        ]
+        return [sys.executable, "-m", "gmijax.train", *told]
+
+    def _script_command(self, folder: Path, seed: str, *, is_short: bool) -> list[str]:
+        told = [
+            f"--env_name={playground_name(str(self._config.env.name))}",
+            *(f"--num_evals={self._given.tests + 1}", f"--logdir={folder}", "--num_videos=1"),
+            *shlex.split(self._given.script),
+            # Fewer steps than its first part has, so that it makes that alone.
+            *(("--num_timesteps=1", "--num_evals=2") if is_short else (f"--seed={seed}",)),
+        ]
+        return [sys.executable, "-m", "benchmarks.peers.playground_script", *told]
+
+    def _test(self) -> None:
+        """All checkpoints, in a process of their own."""
+        given, out = self._given, self._scratch / "walks.json"
+        asked = {
+            "env": to_dict(self._config.env),
+            "impl": self._config.physics.impl,
+            "num_envs": given.envs,
+            "seed": given.test_seed,
+            "runs": [[one["folder"] for one in run["checkpoints"]] for run in self.runs],
+        }
+        write_json(self._scratch / "tests.json", asked)
+        module = [sys.executable, "-m", "benchmarks.walking_tests"]
+        command = [*module, str(self._scratch / "tests.json"), str(out)]
+        cache = {"JAX_COMPILATION_CACHE_DIR": str(self._scratch / "xla")}
+        code = run_command(command, self._deadline_s, cache)
+        found = read_json(out)["walks"] if out.exists() else [[] for _ in self.runs]
+        for run, walks in zip(self.runs, found, strict=True):
+            for checkpoint, walk in zip(run["checkpoints"], walks, strict=False):
+                checkpoint["walk"] = walk
+            run["walks_from"] = walks_from(run["checkpoints"], is_complete=code == 0)
+
+    def _write(self) -> None:
+        rows = summary(self.runs)
+        with self.file.changing() as results:
+            results.update(task=self._config.env.label, rows=rows, runs=self.runs)
+
+
+def walks_from(
+    checkpoints: Sequence[Mapping[str, Any]], *, is_complete: bool
+) -> dict[str, Any] | None:
+    """The checkpoint from which on a training walks, None without one; see the module."""
+    tested = [one for one in checkpoints if "walk" in one]
+    for number, one in enumerate(tested):
+        after = tested[number + 1 : number + 2]
+        is_last = is_complete and number == len(checkpoints) - 1
+        if one["walk"]["walks"] and (is_last or (after and after[0]["walk"]["walks"])):
+            return {key: value for key, value in one.items() if key not in ("folder", "walk")}
+    return None
+
+
+def summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Of each trainer: how many trainings walk, and least, median and most of when they do."""
+    rows: dict[str, Any] = {}
+    for trainer in dict.fromkeys(run["trainer"] for run in runs):
+        mine = [run for run in runs if run["trainer"] == trainer]
+        walking = [run["walks_from"] for run in mine if run.get("walks_from")]
+        spread = {
+            key: _spread([one[key] for one in walking])
+            for key in ("env_steps", "command_s", "training_s")
+        }
+        rows[trainer] = {"seeds": len(mine), "walk": len(walking), **spread}
+    return rows
+
+
+def _spread(values: Sequence[float | None]) -> list[float] | None:
+    known = [value for value in values if value is not None]
+    return [min(known), statistics.median(known), max(known)] if known else None
+
+
+def _ours(folder: Path, started_s: float) -> list[dict[str, Any]]:
+    """Checkpoints of a run of ours, the fewest steps first, and seconds until they were there."""
+    run = RunPaths(folder / "run")
+    trained = {line["env_steps"]: line.get("wall_s") for line in read_metrics(run.metrics)}
+    metas = [(path, CheckpointMeta.read(path)) for path in checkpoints_of(run.root)]
+    return [
+        {
+            "folder": str(path),
+            "env_steps": meta.env_steps,
+            "command_s": None if meta.time_s is None else meta.time_s - started_s,
+            "training_s": trained.get(meta.env_steps),
+        }
+        for path, meta in metas
+    ]
+
+
+def _theirs(folder: Path, started_s: float) -> list[dict[str, Any]]:
+    """As `_ours`, of Playground's script, which does not say when it made its first step."""
+    found = sorted(folder.glob("*/checkpoints/*/ppo_network_config.json"))
+    return [
+        {
+            "folder": str(path.parent),
+            "env_steps": int(path.parent.name),
+            "command_s": path.stat().st_mtime - started_s,
+            "training_s": None,
+        }
+        for path in found
+    ]
+
+
+def main() -> int:
+    """Measures what the command line asks for; returns 1 if a training of ours failed, else 0."""
+    given = _options()
+    config = gmijax.compose(*given.overrides)
+    if robot_of(config.env) is None:
+        raise ConfigError(f"env={config.env.label}: has no walking test")
+    if not isinstance(config.num_envs, int):
+        raise ConfigError(f"num_envs={config.num_envs}: must be a number here")
+    with tempfile.TemporaryDirectory() as scratch:
+        benchmark = Benchmark(given, config, (given.runs or Path(scratch)).absolute())
+        benchmark.run()
+    for trainer, row in summary(benchmark.runs).items():
+        sys.stdout.write(f"{trainer}: {row}\n")
+    return int(any(run["code"] for run in benchmark.runs if run["trainer"] == OURS))
+
+
+def _options() -> argparse.Namespace:
+    parser = options("walking", __doc__)
+    parser.add_argument("overrides", nargs="*", help="of our trainings, e.g. env=go1")
+    parser.add_argument("--seeds", type=int, default=5, help="trainings of each kind")
+    parser.add_argument("--tests", type=int, default=20, help="checkpoints of a training")
+    parser.add_argument("--envs", type=int, default=NUM_ENVS, help="environments of a test")
+    parser.add_argument("--test-seed", type=int, default=0, help="of the test's starts")
+    parser.add_argument("--cold", action="store_true", help="compile in every training")
+    parser.add_argument("--script", help="train with Playground's script too, with these flags")
+    parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
+    parser.add_argument("--runs", type=Path, help="keep the trainings here, without environments")
+    return parser.parse_intermixed_args()
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(main))

@@ -1,0 +1,156 @@
+"""From which checkpoint on a training walks, and whose policies are tested."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.evaluation import walking_tables
+from benchmarks.evaluation.figures import NOT_MEASURED
+from benchmarks.records import ResultsFile
+from benchmarks.walking import _theirs, summary, walks_from
+from benchmarks.walking_tests import policy_of, walks_twice
+from gmijax.player.policy import PlainPolicy, write_policy
+from gmijax.runs.folder import POLICY
+
+
+def checkpoints(*walks: bool | None) -> list[dict[str, Any]]:
+    return [
+        {
+            "folder": "x",
+            "env_steps": 10 * number,
+            "command_s": 2.0 * number,
+            "training_s": 1.0 * number,
+            **({} if walk is None else {"walk": {"walks": walk}}),
+        }
+        for number, walk in enumerate(walks, 1)
+    ]
+
+
+def test_a_training_walks_from_the_first_of_two_checkpoints_in_a_row():
+    found = walks_from(checkpoints(False, True, False, True, True, None), is_complete=True)
+    assert found == {"env_steps": 40, "command_s": 8.0, "training_s": 4.0}
+
+
+def test_the_last_checkpoint_is_enough_if_nothing_was_left_out():
+    found = walks_from(checkpoints(False, True), is_complete=True)
+    assert found is not None
+    assert found["env_steps"] == 20
+    assert walks_from(checkpoints(False, True), is_complete=False) is None
+    assert walks_from(checkpoints(False, True, None), is_complete=True) is None
+    assert walks_from([], is_complete=True) is None
+
+
+def test_tests_end_with_the_second_in_a_row_that_walks():
+    walks = [one["walk"] for one in checkpoints(True, False, True, True)]
+    assert [walks_twice(walks[:n]) for n in range(1, 5)] == [False, False, False, True]
+
+
+def test_summary_has_least_median_and_most_of_those_that_walk():
+    runs = [
+        {"trainer": "gmijax", "walks_from": walks_from(checkpoints(*walks), is_complete=True)}
+        for walks in ((True, True), (False, True, True), (False, False), (True, True))
+    ]
+    row = summary([*runs, {"trainer": "train-jax-ppo"}])
+    assert row["gmijax"] == {
+        "seeds": 4,
+        "walk": 3,
+        "env_steps": [10, 10, 20],
+        "command_s": [2.0, 2.0, 4.0],
+        "training_s": [1.0, 1.0, 2.0],
+    }
+    assert row["train-jax-ppo"]["walk"] == 0
+    assert row["train-jax-ppo"]["command_s"] is None
+
+
+def test_checkpoints_of_playgrounds_script_are_found_by_their_steps(tmp_path):
+    for steps in (2000, 1000):
+        folder = tmp_path / "Go1-now" / "checkpoints" / f"{steps:012d}"
+        folder.mkdir(parents=True)
+        (folder / "ppo_network_config.json").write_text("{}")
+    assert [one["env_steps"] for one in _theirs(tmp_path, 0.0)] == [1000, 2000]
+
+
+class Sized:
+    """An `Env` in so far as policies ask for it: 5 numbers for the policy, 3 more besides."""
+
+    class spec:  # noqa: N801
+        actor_obs_size = 5
+
+
+def test_our_policy_acts_in_jax_as_in_numpy(tmp_path):
+    rng = np.random.default_rng(0)
+    kernels = [rng.normal(size=shape).astype(np.float32) for shape in ((5, 8), (8, 4))]
+    biases = [rng.normal(size=n).astype(np.float32) for n in (8, 4)]
+    ones = np.ones(5, np.float32)
+    policy = PlainPolicy(kernels, biases, 0.5 * ones, 2 * ones, 10.0, "tanh_normal", 2, {})
+    write_policy(tmp_path / POLICY, policy)
+    whose, found = policy_of(tmp_path, Sized)
+    obs = rng.normal(size=(3, 8)).astype(np.float32)
+    import jax
+
+    assert whose == "gmijax"
+    acted = jax.jit(found.act)(found.weights, obs)
+    assert np.asarray(acted) == pytest.approx(policy(obs), abs=1e-5)
+
+
+def test_a_policy_of_brax_gets_its_observations_by_name(tmp_path):
+    pytest.importorskip("brax")
+    import jax
+
+    # By name: it is not installed where gmijax is checked.
+    statistics_of = importlib.import_module("brax.training.acme.running_statistics")
+    specs = importlib.import_module("brax.training.acme.specs")
+    checkpoint = importlib.import_module("brax.training.agents.ppo.checkpoint")
+    networks = importlib.import_module("brax.training.agents.ppo.networks")
+    config_dict = importlib.import_module("ml_collections.config_dict")
+
+    sizes = {"state": (5,), "privileged_state": (8,)}
+    kwargs = {"policy_hidden_layer_sizes": (4,), "policy_obs_key": "state"}
+    network = networks.make_ppo_networks(
+        sizes, 2, preprocess_observations_fn=statistics_of.normalize, **kwargs
+    )
+    shapes = {name: specs.Array(shape, np.dtype("float32")) for name, shape in sizes.items()}
+    statistics = statistics_of.init_state(shapes)
+    key = jax.random.key(0)
+    params = (statistics, network.policy_network.init(key), network.value_network.init(key))
+    config = config_dict.ConfigDict(
+        {
+            "network_factory_kwargs": kwargs,
+            "normalize_observations": True,
+            "observation_size": sizes,
+            "action_size": 2,
+        }
+    )
+    checkpoint.save(tmp_path, 7, params, config)
+    folder = tmp_path / f"{7:012d}"
+    assert json.loads((folder / "ppo_network_config.json").read_text())["action_size"] == 2
+    whose, found = policy_of(folder, Sized)
+    obs = np.random.default_rng(0).normal(size=(3, 13)).astype(np.float32)
+    named = {"state": obs[:, :5], "privileged_state": obs[:, 5:]}
+    act = networks.make_inference_fn(network)(params, deterministic=True)
+    assert whose == "brax"
+    acted = jax.jit(found.act)(found.weights, obs)
+    assert np.asarray(acted) == pytest.approx(np.asarray(act(named, key)[0]), abs=1e-6)
+
+
+def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypatch):
+    monkeypatch.setattr(walking_tables, "RESULTS", tmp_path)
+    assert walking_tables.walking() == [NOT_MEASURED]
+    row = {"seeds": 5, "walk": 5, "env_steps": [4e7, 5e7, 6e7]}
+    for is_cold, seconds in ((False, 99.0), (False, 60.0), (True, 100.0)):
+        path = tmp_path / "walking-go1-nvidia-h100.json"
+        file = ResultsFile(path, "walking", {"cold": is_cold}, device="H100")
+        spread = {"training_s": [50.0, seconds, 120.0], "command_s": None}
+        with file.changing() as results:
+            results.update(task="go1", rows={"gmijax": row | spread})
+    lines = walking_tables.walking()
+    rows = [line for line in lines if line.startswith("| `go1`")]
+    assert rows == [
+        "| `go1` | gmijax | from the cache | 5 of 5 | 50 (40 to 60) | 60 (50 to 120) |  |",
+        "| `go1` | gmijax | compiled anew | 5 of 5 | 50 (40 to 60) | 100 (50 to 120) |  |",
+    ]
