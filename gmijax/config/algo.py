@@ -53,6 +53,11 @@ class PolicyConfig(KeyGroup):
         default=False,
     )
     policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network", low=1)
+    activation: Literal["elu", "layer_norm_silu"] = doc(
+        "what comes behind the hidden layers of both networks: ELU, or layer norm and SiLU, as "
+        "FastSAC has them",
+        default="elu",
+    )
     policy_obs_key: Literal["auto", "state", "privileged_state"] = doc(
         "the policy sees what the task has for it (state), or also what the task has for the "
         "value function alone (privileged_state), as a teacher of algo=distill may; auto: state",
@@ -105,6 +110,16 @@ class PolicyConfig(KeyGroup):
     def kept_steps(self) -> int:
         """Steps of every environment whose experience is in memory at once."""
         return self.unroll_length
+
+    @property
+    def kept_key(self) -> str:
+        """The key that says so."""
+        return "algo.unroll_length"
+
+    @property
+    def kept_itemsize(self) -> int:
+        """Bytes of each number of an observation or action of that."""
+        return 4
 
     def with_checkpoints(self, find: Callable[[str, str], Path]) -> Self:
         """This configuration with what it takes from other runs as paths of checkpoints.

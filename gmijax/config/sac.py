@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,6 +23,12 @@ class SacConfig(PolicyConfig):
     # algo= sets it.
     name: Literal["sac"] = "sac"
     discounting: float = doc("discount factor per step, 0 to 1", low=0.0, high=1.0)
+    n_step: int = doc(
+        "steps whose rewards a target sums before it takes the critics' word; fewer where an "
+        "episode ends",
+        default=1,
+        low=1,
+    )
     reward_scaling: float = doc(
         "factor on rewards before learning (logged returns are unscaled)", positive=True
     )
@@ -29,12 +36,26 @@ class SacConfig(PolicyConfig):
     updates_per_step: int = doc(
         "updates of the critics after every step of all environments of a GMI", low=1
     )
-    policy_every: int = doc("updates of the critics for every one of the policy", low=1)
+    policy_every: int = doc(
+        "updates of the critics for every one of the policy; divides updates_per_step, or is a "
+        "multiple of it that divides unroll_length x updates_per_step",
+        low=1,
+    )
     replay_steps: int = doc(
         "steps of every environment that the replay holds, a multiple of unroll_length", low=2
     )
     learning_starts: int = doc(
         "steps of every environment before the first update, also after a resume", low=2
+    )
+    replay_precision: Literal["float32", "float16"] = doc(
+        "of observations and actions in the replay; float16 keeps observations in units of their "
+        "statistics after the first iteration, which is not learnt from",
+        default="float32",
+    )
+    save_replay: bool = doc(
+        "checkpoints hold the replay too, and a resumed run learns on with it; false: it fills "
+        "the replay anew first",
+        default=False,
     )
     critic_hidden_layer_sizes: tuple[int, ...] = doc("widths of each of the two critics", low=1)
     num_atoms: int = doc("atoms of the distribution of returns", low=2)
@@ -57,37 +78,67 @@ class SacConfig(PolicyConfig):
         """See `PolicyConfig`."""
         return self.replay_steps
 
+    @property
+    def kept_key(self) -> str:
+        """See `PolicyConfig`."""
+        return "algo.replay_steps"
+
+    @property
+    def kept_itemsize(self) -> int:
+        """See `PolicyConfig`."""
+        return 4 if self.replay_precision == "float32" else 2
+
+    @property
+    def rounds_per_turn(self) -> int:
+        """Steps of all environments after which the policy learns, in them or once after them."""
+        return max(1, self.policy_every // self.updates_per_step)
+
     def check_job(self, num_envs: int | None, template: str) -> None:
         """See `PolicyConfig`."""
-        fewest = (num_envs or self.batch_size) * self.learning_starts
-        for key, value, wrong, allowed in (
-            (
-                *("replay_steps", self.replay_steps),
-                self.replay_steps % self.unroll_length,
-                f"a multiple of algo.unroll_length={self.unroll_length}",
-            ),
-            (
-                *("learning_starts", self.learning_starts),
-                self.learning_starts > self.replay_steps,
-                f"at most algo.replay_steps={self.replay_steps}",
-            ),
-            (
-                *("target_std", self.target_std),
-                self.target_std > _WIDEST_STD,
-                f"at most {_WIDEST_STD}: a distribution of actions in [-1, 1] has no more entropy",
-            ),
-            (
-                *("distribution_type", self.distribution_type),
-                self.distribution_type != "tanh_normal",
-                "tanh_normal",
-            ),
-            ("preserve_outputs", self.preserve_outputs, self.preserve_outputs, "false"),
-            ("target_rate", self.target_rate, self.target_rate > 1.0, "at most 1"),
-            (
-                *("batch_size", self.batch_size),
-                self.batch_size > fewest,
-                f"at most num_envs x algo.learning_starts = {fewest}",
-            ),
-        ):
-            if wrong:
+        for key, is_wrong, allowed in (*self._sizes(num_envs), *self._policy()):
+            if is_wrong:
+                value = getattr(self, key)
                 raise ConfigError(f"algo.{key}={value}: with algo=sac must be {allowed}")
+
+    def _sizes(self, num_envs: int | None) -> Iterator[tuple[str, bool, str]]:
+        """Keys, whether they are wrong, and what is allowed: of the replay and of updates."""
+        length, updates, every = self.unroll_length, self.updates_per_step, self.policy_every
+        yield (
+            "replay_steps",
+            self.replay_steps % length != 0,
+            f"a multiple of algo.unroll_length={length}",
+        )
+        in_round = updates % every == 0
+        in_rounds = every % updates == 0 and length * updates % every == 0
+        yield (
+            "policy_every",
+            not in_round and not in_rounds,
+            f"a divisor of algo.updates_per_step={updates}, or a multiple of it that divides "
+            f"algo.unroll_length x algo.updates_per_step = {length * updates}",
+        )
+        most = self.replay_steps
+        yield "n_step", self.n_step >= most, f"less than algo.replay_steps={most}"
+        yield "learning_starts", self.learning_starts > most, f"at most algo.replay_steps={most}"
+        fewest = (num_envs or self.batch_size) * self.learning_starts
+        yield (
+            "batch_size",
+            self.batch_size > fewest,
+            f"at most num_envs x algo.learning_starts = {fewest}",
+        )
+        yield (
+            "replay_precision",
+            self.replay_precision != "float32" and not self.normalize_observations,
+            "float32 where algo.normalize_observations=false",
+        )
+
+    def _policy(self) -> Iterator[tuple[str, bool, str]]:
+        """The same of the policy and of what it learns from."""
+        yield (
+            "target_std",
+            self.target_std > _WIDEST_STD,
+            f"at most {_WIDEST_STD}: a distribution of actions in [-1, 1] has no more entropy",
+        )
+        only = "tanh_normal"
+        yield "distribution_type", self.distribution_type != only, only
+        yield "preserve_outputs", self.preserve_outputs, "false"
+        yield "target_rate", self.target_rate > 1.0, "at most 1"

@@ -32,7 +32,7 @@ from gmijax.control.restarts import (
     with_gpus_left,
     with_nodes_left,
 )
-from gmijax.control.start_point import StartPoint, find_start_point
+from gmijax.control.start_point import StartPoint, find_start_point, forgotten
 from gmijax.control.summary import next_steps, train_outcome, train_summary
 from gmijax.control.wandb_link import followed, require_wandb
 from gmijax.errors import ConfigError
@@ -221,6 +221,8 @@ class _TrainingJob:
         if attempt:
             self._look_again()
         config = started_from(self._config, checkpoint)
+        if (lost := forgotten(config, self._plan)) is not None:
+            self._console.print(lost)
         write_json(self._run.config, to_dict(config))
         return Launch(
             plan=self._plan,

@@ -23,7 +23,7 @@ from gmijax.control.decide import decide
 from gmijax.control.job import opened, record_end, started_from
 from gmijax.control.progress import ConsoleProgress
 from gmijax.control.restarts import clear_unfinished, keep_logs
-from gmijax.control.start_point import find_start_point
+from gmijax.control.start_point import find_start_point, forgotten
 from gmijax.control.summary import train_outcome
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
@@ -71,7 +71,7 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
             folders.append(its_folder)
             own = dataclasses.replace(own, physics=config.physics)
             members.append(_Member(started_from(own, start_point.checkpoint), run))
-            notes += changes
+            notes += (*changes, *filter(None, [forgotten(members[-1].config, plan)]))
             if start_point.folder is not None:
                 clear_unfinished(run, start_point.checkpoint)
         what = f"{len(members)} runs of {plan.num_envs_per_gmi} environments in one program"

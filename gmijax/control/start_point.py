@@ -6,14 +6,16 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from gmijax.config import EnvConfig, TrainConfig
+from gmijax.config import EnvConfig, SacConfig, TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
+from gmijax.partition.plan import Plan
 from gmijax.runs.folder import (
     RUNS,
     RunPaths,
     create_run,
     given_run,
+    replay_name,
     require_new_run,
 )
 from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpoint
@@ -98,6 +100,34 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
     meta = _require_fit(config, found.checkpoint, "auto")
     is_complete = meta.env_steps >= config.num_timesteps
     return StartPoint(run, found.checkpoint, is_complete, notes)
+
+
+def forgotten(config: TrainConfig, plan: Plan) -> str | None:
+    """What a job that goes on from a checkpoint has experienced and does not know any more.
+
+    None where it goes on with all that it had, or had nothing.
+    """
+    algo = config.algo
+    if config.run.resume is None or not isinstance(algo, SacConfig):
+        return None
+    checkpoint = Path(config.run.resume)
+    meta, before = CheckpointMeta.read(checkpoint), trained_config(checkpoint)[1]
+    was = meta.num_gmis, meta.num_envs, meta.impl
+    now = plan.layout.num_gmis, config.envs_per_gmi, config.physics.impl
+    is_saved = any(checkpoint.glob(replay_name("*")))
+    if algo.save_replay and is_saved and was == now:
+        return None
+    most = meta.num_gmis * meta.num_envs * getattr(before, "replay_steps", algo.replay_steps)
+    if not is_saved:
+        why = "is not in the checkpoint (algo.save_replay=true keeps it)"
+    elif not algo.save_replay:
+        why = "is left out with algo.save_replay=false"
+    else:
+        why = "is of another number of GMIs or environments, or of another physics.impl"
+    return (
+        f"the replay of {min(meta.env_steps, most):,} transitions {why}: it is filled for "
+        f"{algo.learning_starts} steps of every environment before learning goes on"
+    )
 
 
 def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> CheckpointMeta:

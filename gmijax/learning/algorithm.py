@@ -69,6 +69,15 @@ def _itself(memory: Any) -> BatchState:
     return memory
 
 
+def _unchanged(memory: Any, replay: None) -> Any:
+    del replay
+    return memory
+
+
+def _no_replay(learner: Learner[Any], memory: Any) -> None:
+    del learner, memory
+
+
 def _params(state: LearnerState) -> PyTree:
     return state.params
 
@@ -81,10 +90,13 @@ class Algorithm:
       make_learner: networks, optimiser and hyper-parameters for the sizes of an environment.
       init: `(learner, obs_size, key)` to the first state.
       iterate: see `Iterate`.
-      num_averaged: how many float32 GMIs average in one update: gradient and parts of the loss.
+      num_averaged: how many float32 GMIs average in one update, at most: gradient and parts of the
+        loss.
       begin: `(learner, env, environments at their starts)` to the first memory of a GMI; by
         default the environments.
       envs: the environments in a memory, which checkpoints hold.
+      replay: `(learner, memory)` to the experience that checkpoints hold too, None: none.
+      with_replay: `(memory, experience)` to the memory with that of a checkpoint.
       learned: all weights in a state, which have to be finite, and equal on all GMIs.
     """
 
@@ -94,6 +106,8 @@ class Algorithm:
     num_averaged: Callable[[EnvSpec, Any], int]
     begin: Callable[[Learner[Any], BatchedEnv, BatchState], Any] = _environments
     envs: Callable[[Any], BatchState] = _itself
+    replay: Callable[[Learner[Any], Any], PyTree | None] = _no_replay
+    with_replay: Callable[[Any, PyTree], Any] = _unchanged
     learned: Callable[[Any], PyTree] = _params
 
 

@@ -1,9 +1,9 @@
 """Checkpoints of the full state, written with orbax.
 
 `<run>/checkpoints/<12-digit env steps>/{learner,gmi_0,gmi_1,...,meta.json}`: what all GMIs share
-is written by the leader, each GMI's environments by itself. Everything goes to a hidden folder
-that is renamed when all GMIs have finished and all of it is on the disk, so a checkpoint is there
-as a whole or not at all.
+is written by the leader, each GMI's environments, and its replay if asked, by itself. Everything
+goes to a hidden folder that is renamed when all GMIs have finished and all of it is on the disk,
+so a checkpoint is there as a whole or not at all.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, GmijaxError, NonFiniteError, ParameterMismatch, lines_of
 from gmijax.learning.episode_window import Standing
-from gmijax.runs.folder import META, RunPaths, read_json, write_json
+from gmijax.runs.folder import META, RunPaths, read_json, replay_name, write_json
 from gmijax.runs.resume import CheckpointMeta, checkpoints_of, file_check, rank_of
 from gmijax.types import PyTree
 
@@ -97,6 +97,11 @@ def save_learner(paths: RunPaths, env_steps: int, learner_state: PyTree) -> None
 def save_envs(paths: RunPaths, env_steps: int, gmi: int, env_state: PyTree) -> None:
     """Writes the environments of one GMI, as `save_learner` does the shared part."""
     _save(_partial(paths, env_steps) / f"gmi_{gmi}", env_state)
+
+
+def save_replay(paths: RunPaths, env_steps: int, gmi: int, replay: PyTree) -> None:
+    """Writes the replay of one GMI, as `save_learner` does the shared part."""
+    _save(_partial(paths, env_steps) / replay_name(gmi), replay)
 
 
 def save_episodes(
@@ -174,6 +179,11 @@ def has_envs(checkpoint: Path, gmi: int) -> bool:
     return (checkpoint / f"gmi_{gmi}").is_dir()
 
 
+def has_replay(checkpoint: Path, gmi: int) -> bool:
+    """Whether a checkpoint holds the replay of that GMI."""
+    return (checkpoint / replay_name(gmi)).is_dir()
+
+
 def restore_learner(checkpoint: Path, template: T) -> T:
     """The learner's state; `template` gives structure, shapes and dtypes.
 
@@ -219,6 +229,17 @@ def _saved_shapes(folder: Path) -> dict[str, tuple[int, ...]]:
 def restore_envs(checkpoint: Path, gmi: int, template: T) -> T:
     """The environments of one GMI; `template` gives structure, shapes and dtypes."""
     return _restore(checkpoint / f"gmi_{gmi}", template)
+
+
+def restore_replay(checkpoint: Path, gmi: int, template: T) -> T:
+    """The replay of one GMI, in the host's memory; `template` gives structure, shapes and dtypes.
+
+    Raises:
+      ConfigError: it has other shapes.
+    """
+    # Empty arrays of numpy take no memory until they are written.
+    empty = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), template)
+    return on_host(_restore(checkpoint / replay_name(gmi), empty))
 
 
 def digest(tree: PyTree) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gmijax.collectives.interface import Communicator
-from gmijax.learning.checkpoint import finish_checkpoint, save_envs, save_learner
+from gmijax.learning.checkpoint import finish_checkpoint, save_envs, save_learner, save_replay
 from gmijax.learning.report_thread import ReportThread
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.resume import CheckpointMeta
@@ -29,6 +29,7 @@ class CheckpointPart(NamedTuple):
       learner_state: the same on all GMIs; None but for the leader, who writes it.
       env_state: this GMI's environments, None where it has none.
       save_more: writes what else the leader has for it, given the learner's state.
+      replay: this GMI's experience, None where checkpoints hold none.
     """
 
     run: RunPaths
@@ -36,6 +37,7 @@ class CheckpointPart(NamedTuple):
     learner_state: PyTree | None
     env_state: PyTree | None
     save_more: Callable[[Any], None] = lambda _: None
+    replay: PyTree | None = None
 
 
 class CheckpointSaver:
@@ -73,12 +75,14 @@ class CheckpointSaver:
 
         def write() -> None:
             for part in parts:  # In turn: orbax can block when several threads use it.
-                run, meta, learner_state, env_state, save_more = part
-                if env_state is not None:
-                    save_envs(run, meta.env_steps, self._gmi, env_state)
-                if learner_state is not None:
-                    save_learner(run, meta.env_steps, learner_state)
-                    save_more(learner_state)
+                run, env_steps = part.run, part.meta.env_steps
+                if part.env_state is not None:
+                    save_envs(run, env_steps, self._gmi, part.env_state)
+                if part.replay is not None:
+                    save_replay(run, env_steps, self._gmi, part.replay)
+                if part.learner_state is not None:
+                    save_learner(run, env_steps, part.learner_state)
+                    part.save_more(part.learner_state)
 
         self._unnamed = parts
         self._thread.report(write)

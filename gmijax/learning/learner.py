@@ -5,6 +5,7 @@ Checkpoints hold a state of the algorithm (`LearnerState`), all of which can be 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import jax
@@ -127,12 +128,13 @@ def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
             )
     make_distribution, precision = DISTRIBUTIONS[config.distribution_type], config.precision
     distribution = make_distribution(spec.action_size, config.state_dependent_std)
+    network = partial(Mlp, dtype=precision, activation=config.activation)
     # A small output layer makes the first policy's mean about zero wherever the robot is.
-    policy = Mlp(config.policy_hidden_layer_sizes, distribution.output_size, 0.01, precision)
+    policy = network(config.policy_hidden_layer_sizes, distribution.output_size, 0.01)
     return Learner(
         networks=ActorCritic(
             policy,
-            Mlp(value.hidden_layer_sizes, 1, 1.0, precision) if value else None,
+            network(value.hidden_layer_sizes, 1, 1.0) if value else None,
             config.init_noise_std,
             distribution,
             actor_obs_size=None if config.policy_obs_key == "privileged_state" else seen,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -132,7 +133,7 @@ class TrainingLoop:
     def _first(self) -> tuple[TrainState, Any]:
         """State of the learner and this GMI's memory, with an axis of members if several."""
         state = self._members.stacked(self._first_state)
-        memory = None if self._remote else self._members.stacked(self._first_memory)
+        memory = None if self._remote else self._first_memory()
         if self._evaluator is not None:
             self._evaluator.best = best_evaluation(self._members.first.run.root, self._env_steps)
         return state, memory
@@ -143,12 +144,25 @@ class TrainingLoop:
         )
         return state
 
-    def _first_memory(self, member: Member) -> Any:
-        ranks = self._comm
-        envs = first_envs(
-            self._env, member.config, ranks.rank, gmi=self._link.gmi, num_gmis=ranks.world_size
+    def _first_memory(self) -> Any:
+        members, gmi, ranks = self._members, self._link.gmi, self._comm
+        envs = members.stacked(
+            lambda member: first_envs(
+                self._env, member.config, ranks.rank, gmi=gmi, num_gmis=ranks.world_size
+            )
         )
-        return self._algorithm.begin(self._learner, self._env, envs)
+        begin = partial(self._algorithm.begin, self._learner, self._env)
+        template = self._algorithm.replay(self._learner, jax.eval_shape(members.each(begin), envs))
+        replay = members.restored_replay(template, gmi, ranks.world_size)
+        if replay is None and members.is_one:
+            return begin(envs)
+        # In a program, which makes a replay where it stays: there may be no room for another.
+        with_replay = self._algorithm.with_replay
+        if replay is None:
+            make = members.each(begin)
+            return jax.jit(make, donate_argnums=0)(envs)
+        make = members.each(lambda envs, replay: with_replay(begin(envs), replay))
+        return jax.jit(make, donate_argnums=(0, 1))(envs, jax.device_put(replay))
 
     def _compile(self, state: TrainState, memory: Any) -> float:
         """Makes all programs; returns the seconds for which others compiled."""
@@ -262,6 +276,7 @@ class TrainingLoop:
             state,
             learned,
             None if self._remote else self._algorithm.envs(memory),
+            None if self._remote else self._algorithm.replay(self._learner, memory),
             evaluation,
             is_leader=self._is_leader,
         )

@@ -10,20 +10,28 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gmijax.config import TrainConfig
 from gmijax.errors import NonFiniteError, ReportedError
 from gmijax.learning.algorithm import IterationMetrics
-from gmijax.learning.checkpoint import checkpoint_meta, on_host, require_finite, save_episodes
+from gmijax.learning.checkpoint import (
+    checkpoint_meta,
+    on_host,
+    require_finite,
+    restore_replay,
+    save_episodes,
+)
 from gmijax.learning.checkpoint_saver import CheckpointPart
 from gmijax.learning.evaluator import Evaluation
 from gmijax.learning.learner import TrainState
 from gmijax.learning.policy_file import save_policy
-from gmijax.learning.start import first_window
+from gmijax.learning.start import first_window, replay_goes_on
 from gmijax.learning.training_log import TrainingLog, UpdateMetrics
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.types import PyTree
@@ -66,6 +74,7 @@ class Member:
         num_gmis: int,
         state: TrainState | None,
         env_state: PyTree | None,
+        replay: PyTree | None,
         evaluation: Evaluation | None,
     ) -> CheckpointPart:
         """What a checkpoint holds of it; see `CheckpointPart`."""
@@ -77,7 +86,7 @@ class Member:
             save_policy(run, env_steps, config.env, config.algo, host_state)
             save_episodes(run, env_steps, config, episodes)
 
-        return CheckpointPart(run, meta, state, env_state, save_more)
+        return CheckpointPart(run, meta, state, env_state, save_more, replay)
 
     def median_rate(self, steps_per_iteration: int) -> float | None:
         """Environment steps per second of its median iteration."""
@@ -116,6 +125,23 @@ class Members:
         made = [make(member) for member in self._members]
         return made[0] if self.is_one else _stack(made)
 
+    def each(self, make: Callable[..., Any]) -> Callable[..., Any]:
+        """`make` for arguments with an axis of runs where there are several."""
+        return make if self.is_one else jax.vmap(make)
+
+    def restored_replay(self, template: PyTree, gmi: int, num_gmis: int) -> PyTree | None:
+        """What the checkpoints that all runs go on from hold of `template`, in the host's memory.
+
+        With an axis of runs where there are several, as `template` has; None where a run begins
+        without.
+        """
+        configs = [member.config for member in self._members]
+        if template is None or not all(replay_goes_on(one, gmi, num_gmis) for one in configs):
+            return None
+        own = template if self.is_one else jax.eval_shape(partial(_row, number=0), template)
+        found = [restore_replay(Path(str(one.run.resume)), gmi, own) for one in configs]
+        return found[0] if self.is_one else jax.tree.map(lambda *rows: np.stack(rows), *found)
+
     def report(
         self,
         env_steps: int,
@@ -136,6 +162,7 @@ class Members:
         state: TrainState,
         learned: PyTree,
         env_state: PyTree | None,
+        replay: PyTree | None,
         evaluation: Evaluation | None,
         *,
         is_leader: bool,
@@ -146,15 +173,15 @@ class Members:
         """
         learned = jax.device_get(learned)
         learners = on_host(state) if is_leader else None
-        envs = None if env_state is None else on_host(env_state)
+        envs, replays = on_host(env_state), on_host(replay)  # None stays None.
         parts = []
         for number, member in enumerate(self._members):
-            (own, own_envs), weights = (learners, envs), learned
+            (own, *mine), weights = (learners, envs, replays), learned
             if not self.is_one:
-                (own, own_envs), weights = _row(((learners, envs), learned), number)
+                (own, *mine), weights = _row(((learners, envs, replays), learned), number)
             self._try(member, partial(require_finite, weights, member.config.env.label, env_steps))
             if member.error is None:
-                parts.append(member.part(env_steps, num_gmis, own, own_envs, evaluation))
+                parts.append(member.part(env_steps, num_gmis, own, *mine, evaluation))
         return parts
 
     def close(self) -> None:

@@ -1,8 +1,9 @@
 """Policy and value function: two separate multi-layer perceptrons.
 
 The sizes are those of the paper's Table 5 (256:128:64 for most tasks); ELU activations and a
-state-independent standard deviation are what Isaac Gym's PPO uses for the same tasks. What the
-output of the policy's network means is said by its distribution.
+state-independent standard deviation are what Isaac Gym's PPO uses for the same tasks, layer norm
+and SiLU what FastSAC does. What the output of the policy's network means is said by its
+distribution.
 
 In bfloat16, the hidden layers and what goes from one to the next are in it: their products are
 quicker, and half as many bytes are moved. Weights, and all that comes of a network, stay float32.
@@ -18,6 +19,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 
 from gmijax.learning.distributions import Normal
+from gmijax.player.policy import LAYER_NORM_EPSILON
 from gmijax.types import Array, PRNGKey, PyTree
 
 
@@ -48,19 +50,21 @@ def _all_but_bias(*arrays: Any, dtype: Any = None, inexact: bool = True) -> list
 
 
 class Mlp(nn.Module):
-    """Dense layers with ELU between them.
+    """Dense layers with an activation between them.
 
     Attributes:
       hidden: widths of the hidden layers.
       out: width of the linear output layer.
       out_scale: standard deviation scale of the output layer's first weights.
       dtype: what hidden layers compute in; weights and the output layer are float32.
+      activation: see `PolicyConfig.activation`.
     """
 
     hidden: tuple[int, ...]
     out: int
     out_scale: float
     dtype: DTypeLike = jnp.float32
+    activation: str = "elu"
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
@@ -70,7 +74,11 @@ class Mlp(nn.Module):
             hidden = nn.Dense(
                 width, dtype=self.dtype, kernel_init=scaled, promote_dtype=_all_but_bias
             )
-            x = elu(hidden(x).astype(self.dtype))
+            if self.activation == "elu":
+                x = elu(hidden(x).astype(self.dtype))
+            else:
+                norm = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, dtype=self.dtype)
+                x = nn.silu(norm(hidden(x)))
         return nn.Dense(self.out, kernel_init=nn.initializers.orthogonal(self.out_scale))(x)
 
 

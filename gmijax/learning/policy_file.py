@@ -32,7 +32,9 @@ def save_policy(
 def plain_policy(env: EnvConfig, algo: AlgoConfig, state: TrainState, **about: Any) -> PlainPolicy:
     """The policy to act with when the learner has `state`; `about` is noted in it."""
     layers = state.params.policy["params"]
-    names = [f"Dense_{number}" for number in range(len(layers))]
+    num_norms = sum(name.startswith("LayerNorm_") for name in layers)
+    names = [f"Dense_{number}" for number in range(len(layers) - num_norms)]
+    norms = [layers[f"LayerNorm_{number}"] for number in range(num_norms)]
     kernels = [np.asarray(layers[name]["kernel"]) for name in names]
     moments = acting_moments(algo, state)
     seen = len(kernels[0])  # The statistics are also of what only the value function sees.
@@ -47,4 +49,5 @@ def plain_policy(env: EnvConfig, algo: AlgoConfig, state: TrainState, **about: A
         head=algo.distribution_type,
         action_size=len(state.params.log_std),
         about={"env": to_dict(env), **about, "gmijax_version": __version__},
+        norms=[(np.asarray(norm["scale"]), np.asarray(norm["bias"])) for norm in norms],
     )

@@ -13,7 +13,13 @@ from gmijax.compile_once import compile_once
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.devices import memory_limit_bytes
 from gmijax.errors import ConfigError
-from gmijax.learning.checkpoint import has_envs, restore_envs, restore_learner, saved_episodes
+from gmijax.learning.checkpoint import (
+    has_envs,
+    has_replay,
+    restore_envs,
+    restore_learner,
+    saved_episodes,
+)
 from gmijax.learning.episode_window import EpisodeWindow
 from gmijax.learning.learner import Learner, TrainState
 from gmijax.machine.host_limits import detect_host
@@ -107,8 +113,12 @@ def first_envs(
     meta = None if resume is None else CheckpointMeta.read(resume)
     if meta is not None:  # Other environments than the first run's: never its starts again.
         key = jax.random.fold_in(key, meta.env_steps % 2**31)
+    algo = config.algo
     env_state = begin_episodes(
-        env, key, place * num_envs, num_envs, kept_steps=config.algo.kept_steps
+        *(env, key, place * num_envs, num_envs),
+        kept_steps=algo.kept_steps,
+        kept_itemsize=algo.kept_itemsize,
+        kept_key=algo.kept_key,
     )
     if resume is None or gmi is None or not envs_go_on(config, gmi, num_gmis):
         return env_state
@@ -122,6 +132,12 @@ def envs_go_on(config: TrainConfig, gmi: int, num_gmis: int | None) -> bool:
     meta = CheckpointMeta.read(Path(config.run.resume))
     own = config.envs_per_gmi, config.physics.impl
     return num_gmis in (None, meta.num_gmis) and (meta.num_envs, meta.impl) == own
+
+
+def replay_goes_on(config: TrainConfig, gmi: int, num_gmis: int) -> bool:
+    """Whether a GMI goes on with the replay of its checkpoint: where its environments go on."""
+    goes_on = envs_go_on(config, gmi, num_gmis)
+    return goes_on and has_replay(Path(str(config.run.resume)), gmi)
 
 
 def first_window(
@@ -144,11 +160,19 @@ def first_window(
 
 
 def begin_episodes(
-    env: BatchedEnv, key: PRNGKey, first_env: int, num_envs: int, *, kept_steps: int
+    env: BatchedEnv,
+    key: PRNGKey,
+    first_env: int,
+    num_envs: int,
+    *,
+    kept_steps: int,
+    kept_itemsize: int = 4,
+    kept_key: str = "unroll_length",
 ) -> BatchState:
     """Environments `first_env` to `first_env + num_envs - 1` of a job at their starts.
 
-    `kept_steps` are the steps of all of them whose experience is in memory at once.
+    `kept_steps` are the steps of all of them whose experience is in memory at once, with
+    `kept_itemsize` bytes for each number of an observation or action; `kept_key` says how many.
 
     Raises:
       ConfigError: the state of so many environments, and their experience, which is the least
@@ -158,15 +182,17 @@ def begin_episodes(
     # Before anything of that size is made. It is traced once: the call below finds it.
     keys = jax.ShapeDtypeStruct((num_envs,), key.dtype)
     state = jax.tree.leaves(init.eval_shape(env.model, keys))
-    step_floats = env.spec.obs_size + env.spec.action_size + 1  # And the reward.
+    step_bytes = kept_itemsize * (env.spec.obs_size + env.spec.action_size)
+    step_bytes += jnp.dtype(jnp.float32).itemsize  # The reward.
     least_bytes = sum(leaf.size * leaf.dtype.itemsize for leaf in state)
-    least_bytes += num_envs * kept_steps * step_floats * jnp.dtype(jnp.float32).itemsize
+    least_bytes += num_envs * kept_steps * step_bytes
     limit_bytes = _memory_bytes()
     if limit_bytes is not None and least_bytes > limit_bytes:
+        need, have = (f"{num_bytes / 2**30:.3g} GiB" for num_bytes in (least_bytes, limit_bytes))
         raise ConfigError(
-            f"num_envs={num_envs}: a GMI would need more than {least_bytes / 2**30:.3g} GiB for "
-            f"them and {kept_steps} steps of each, and has {limit_bytes / 2**30:.3g} GiB; allowed "
-            f"are less than {int(limit_bytes * num_envs / least_bytes)}"
+            f"num_envs={num_envs}: a GMI would need more than {need} for them and {kept_steps} "
+            f"steps of each ({kept_key}), and has {have}; allowed are less than "
+            f"{int(limit_bytes * num_envs / least_bytes)}"
         )
     starts = env_keys(key, first_env, num_envs)
     return compile_once(init.lower(env.model, starts))(env.model, starts)

@@ -25,6 +25,11 @@ from gmijax.runs.folder import POLICY, open_regular, write_bytes
 Floats: TypeAlias = npt.NDArray[np.float32]
 
 FORMAT: Final = 1
+FORMAT_WITH_NORMS: Final = 2
+"""Versions that do not know layer norm refuse its files, and read all others."""
+
+LAYER_NORM_EPSILON: Final = 1e-6
+"""What layer norm adds to the variance."""
 
 _HEADS: Final = ("normal", "tanh_normal")
 """Names of `gmijax.learning.distributions`: the action is the mean, or the tanh of it."""
@@ -35,13 +40,15 @@ class PlainPolicy:
     """A policy that acts without noise: `policy(obs) -> actions`.
 
     Attributes:
-      kernels: weights [in, out] of every layer, ELU between them, float32.
+      kernels: weights [in, out] of every layer, float32.
       biases: [out] of every layer.
       obs_mean: [O] that is subtracted from observations.
       obs_std: [O] that they are divided by then.
       obs_clip: normalised observations are clipped to +- this; None: they are not.
       head: what the network's output is, `normal` or `tanh_normal`.
       action_size: A; the network may give more, which is noise.
+      norms: scale and bias [out] of the layer norm behind every layer but the last, before SiLU;
+        none: there is ELU behind them.
       about: what the policy is, as plain data: `env` (the keys of its task), `env_steps` and
         `gmijax_version`, and what else its writer noted.
     """
@@ -54,6 +61,7 @@ class PlainPolicy:
     head: str
     action_size: int
     about: Mapping[str, Any]
+    norms: Sequence[tuple[Floats, Floats]] = ()
 
     @property
     def obs_size(self) -> int:
@@ -71,11 +79,21 @@ class PlainPolicy:
         x = (seen - self.obs_mean) / self.obs_std
         if self.obs_clip is not None:
             x = xp.clip(x, -self.obs_clip, self.obs_clip)
-        for kernel, bias in zip(self.kernels[:-1], self.biases[:-1], strict=True):
-            x = x @ kernel + bias
-            x = xp.where(x > 0, x, xp.expm1(xp.minimum(x, 0)))
+        for number in range(len(self.kernels) - 1):
+            x = self._activated(number, x @ self.kernels[number] + self.biases[number])
         mean = (x @ self.kernels[-1] + self.biases[-1])[..., : self.action_size]
         return xp.clip(xp.tanh(mean) if self.head == "tanh_normal" else mean, -1.0, 1.0)
+
+    def _activated(self, number: int, x: Any) -> Any:
+        """What comes of the sums [..., W] of a hidden layer."""
+        xp = array_module(x)
+        if not self.norms:
+            return xp.where(x > 0, x, xp.expm1(xp.minimum(x, 0)))
+        scale, bias = self.norms[number]
+        variance = xp.var(x, axis=-1, keepdims=True)
+        x = (x - xp.mean(x, axis=-1, keepdims=True)) / xp.sqrt(variance + LAYER_NORM_EPSILON)
+        x = scale * x + bias
+        return x * (0.5 * xp.tanh(0.5 * x) + 0.5)  # SiLU; an exponential would overflow.
 
 
 def write_policy(path: Path, policy: PlainPolicy, *, half: bool = False) -> None:
@@ -85,8 +103,10 @@ def write_policy(path: Path, policy: PlainPolicy, *, half: bool = False) -> None
     for number, (kernel, bias) in enumerate(layers):
         arrays[f"kernel_{number}"] = kernel.astype(np.float16) if half else kernel
         arrays[f"bias_{number}"] = bias
+    for number, (scale, bias) in enumerate(policy.norms):
+        arrays[f"norm_scale_{number}"], arrays[f"norm_bias_{number}"] = scale, bias
     head = {
-        "format": FORMAT,
+        "format": FORMAT_WITH_NORMS if policy.norms else FORMAT,
         "num_layers": len(policy.kernels),
         "obs_clip": policy.obs_clip,
         "head": policy.head,
@@ -130,12 +150,13 @@ def checkpoint_policy(checkpoint: Path) -> PlainPolicy:
 
 def _policy_of(data: Mapping[str, Any]) -> PlainPolicy:
     head = json.loads(str(data["header"]))
-    if head["format"] != FORMAT or head["head"] not in _HEADS:
+    if head["format"] not in (FORMAT, FORMAT_WITH_NORMS) or head["head"] not in _HEADS:
         raise ValueError("written by another version of gmijax")
     kernels, biases = (
         [_floats(data[f"{kind}_{number}"]) for number in range(head["num_layers"])]
         for kind in ("kernel", "bias")
     )
+    has_norms = head["format"] == FORMAT_WITH_NORMS
     policy = PlainPolicy(
         kernels,
         biases,
@@ -145,6 +166,10 @@ def _policy_of(data: Mapping[str, Any]) -> PlainPolicy:
         head["head"],
         head["action_size"],
         head["about"],
+        [
+            (_floats(data[f"norm_scale_{number}"]), _floats(data[f"norm_bias_{number}"]))
+            for number in range(head["num_layers"] - 1 if has_norms else 0)
+        ],
     )
     _require_sizes(policy)
     return policy
@@ -159,6 +184,8 @@ def _require_sizes(policy: PlainPolicy) -> None:
     widths = [policy.obs_size, *(len(bias) for bias in policy.biases)]
     shapes = [kernel.shape for kernel in policy.kernels]
     fits = shapes == list(itertools.pairwise(widths))
+    norms = [array.shape for pair in policy.norms for array in pair]
+    fits &= norms in ([], [(width,) for width in widths[1:-1] for _ in range(2)])
     if not (shapes and fits and policy.obs_std.shape == policy.obs_mean.shape):
         raise ValueError("sizes of its layers do not fit")
     if not 0 < policy.action_size <= widths[-1]:

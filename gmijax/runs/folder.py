@@ -184,6 +184,11 @@ def create_run(run_dir: str | None, name: str | None, prefix: str) -> RunPaths:
     raise ConfigError(f"{key}={root}: no free name")
 
 
+def replay_name(gmi: int | str) -> str:
+    """The folder of a GMI's replay in a checkpoint; with "*" the pattern of all of them."""
+    return f"replay_{gmi}"
+
+
 def given_run(run_dir: str | None, name: str | None) -> Path | None:
     """The run folder that the user names, None if none."""
     if run_dir:

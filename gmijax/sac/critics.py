@@ -6,40 +6,23 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from flax import linen as nn
-from jax.typing import DTypeLike
 
 from gmijax.config import SacConfig
+from gmijax.learning.policy import Mlp
 from gmijax.types import Array, PRNGKey, PyTree
 
 NUM_CRITICS = 2
-
-
-class _Critic(nn.Module):
-    """Layer norm and SiLU behind every hidden layer, as FastSAC has them."""
-
-    hidden: tuple[int, ...]
-    num_atoms: int
-    dtype: DTypeLike
-
-    @nn.compact
-    def __call__(self, x: Array) -> Array:
-        """Maps [..., O + A] to logits [..., Z] float32."""
-        for width in self.hidden:
-            x = nn.Dense(width, dtype=self.dtype)(x)
-            x = nn.silu(nn.LayerNorm(dtype=self.dtype)(x))
-        return nn.Dense(self.num_atoms)(x.astype(jnp.float32))
 
 
 class Critics(NamedTuple):
     """Both critics; weights are passed in, with a leading axis [2].
 
     Attributes:
-      network: of one of them.
+      network: of one of them, from [..., O + A] to logits [..., Z].
       atoms: [Z], the returns that their probabilities are of.
     """
 
-    network: nn.Module
+    network: Mlp
     atoms: Array
 
     def init(self, key: PRNGKey, obs_size: int, action_size: int) -> PyTree:
@@ -62,7 +45,8 @@ def critics_of(config: SacConfig) -> Critics:
     """The critics of a configuration."""
     atoms = jnp.linspace(-config.value_range, config.value_range, config.num_atoms)
     sizes = config.critic_hidden_layer_sizes
-    return Critics(_Critic(sizes, config.num_atoms, config.precision), atoms)
+    network = Mlp(sizes, config.num_atoms, 1.0, config.precision, "layer_norm_silu")
+    return Critics(network, atoms)
 
 
 def projected(atoms: Array, values: Array, probs: Array) -> Array:

@@ -11,7 +11,6 @@ from gmijax.config import SacConfig
 from gmijax.learning.learner import Learner
 from gmijax.learning.policy import ActorCriticParams
 from gmijax.sac.critics import Critics, projected
-from gmijax.sac.replay import CUT, GOES_ON
 from gmijax.types import Array, PRNGKey, PyTree
 
 
@@ -21,16 +20,25 @@ class Batch(NamedTuple):
     Attributes:
       obs: [B, O], normalised.
       action: [B, A].
-      reward: [B], scaled.
-      kind: [B], see `gmijax.sac.replay`.
+      reward: [B], of one or several steps, scaled.
+      discount, is_known: [B], see `gmijax.sac.replay.Transitions`.
       next_obs: [B, O], normalised.
     """
 
     obs: Array
     action: Array
     reward: Array
-    kind: Array
+    discount: Array
+    is_known: Array
     next_obs: Array
+
+
+class CriticFigures(NamedTuple):
+    """Of an update of the critics, [] each; see `gmijax.sac.updates.SacLosses`."""
+
+    critic_loss: Array
+    entropy: Array
+    end_atoms: Array
 
 
 def sampled_action(
@@ -46,16 +54,17 @@ def sampled_action(
 def target_probs(
     critics: Critics,
     targets: PyTree,
-    config: SacConfig,
     batch: Batch,
     next_action: Array,
     next_log_prob: Array,
     temperature: Array,
 ) -> Array:
-    """What each critic shall say [2, B, Z]: its own target critic's returns one step on."""
-    goes_on = config.discounting * (batch.kind == GOES_ON)[:, None]
+    """What each critic shall say [2, B, Z]: its own target critic's returns after the rewards.
+
+    Of several steps the entropy counts in the last state alone, as in FastTD3 and FlashSAC.
+    """
     after = critics.atoms - temperature * next_log_prob[:, None]
-    values = batch.reward[:, None] + goes_on * after
+    values = batch.reward[:, None] + batch.discount[:, None] * after
     probs = jnp.exp(critics.log_probs(targets, batch.next_obs, next_action))
     return jax.lax.stop_gradient(projected(critics.atoms, values, probs))
 
@@ -65,9 +74,9 @@ def critic_loss(
 ) -> tuple[Array, Array]:
     """Cross-entropy with `wanted` [2, B, Z], summed over critics, and the mass at both ends [].
 
-    Each is a mean over transitions that are not cut.
+    Each is a mean over transitions that are known.
     """
-    counts = (batch.kind != CUT).astype(jnp.float32)
+    counts = batch.is_known.astype(jnp.float32)
     weight = counts / jnp.maximum(jnp.sum(counts), 1.0)
     log_probs = critics.log_probs(params, batch.obs, batch.action)
     loss = -jnp.sum(jnp.sum(wanted * log_probs, axis=-1) * weight)

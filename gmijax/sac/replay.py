@@ -3,7 +3,8 @@
 A ring of S steps of N environments. Every observation is there once: that behind a step is the one
 of the next row, where an episode goes on. Where it ended, the next row is the start of another
 one: nothing is needed of it after a termination, and where time ran out, or a simulation diverged,
-the step is not learnt from. That leaves out one step of an episode.
+what follows is not known. A return of several steps ends before such a step, and a transition
+that begins with it is not learnt from. That leaves out one step of an episode.
 """
 
 from __future__ import annotations
@@ -12,24 +13,32 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
+from gmijax.learning.normalize import Moments, from_units, in_units, no_samples, with_std_floor
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array, PRNGKey
 
 GOES_ON, TERMINATED, CUT = 0, 1, 2
 """What follows a step: more of the episode, nothing, or what is not known."""
 
+_LEAST_UNIT = 1e-2
+"""Of observations in float16: that of an input that does not move at first is of a usual size, so
+that it is not out of range when it does."""
+
 
 class Replay(NamedTuple):
     """The ring.
 
     Attributes:
-      obs: [S, N, O] float32, raw.
-      action: [S, N, A], as the environment got it.
-      reward: [S, N], unscaled.
+      obs: [S, N, O] in `units`, float32 or float16.
+      action: [S, N, A], as the environment got it, of the same dtype.
+      reward: [S, N] float32, unscaled.
       kind: [S, N] int8: `GOES_ON`, `TERMINATED` or `CUT`.
       head: [] int32, the row that is written next.
       filled: [] int32, rows that are written.
+      units: statistics of observations when the ring was begun; none, and observations are raw,
+        in float32, or where there were none.
     """
 
     obs: Array
@@ -38,38 +47,47 @@ class Replay(NamedTuple):
     kind: Array
     head: Array
     filled: Array
+    units: Moments
 
 
 class Transitions(NamedTuple):
-    """What updates learn from; leading axis [B], or [S', N] before they are in a `Replay`.
+    """What updates learn from; leading axis [B].
 
     Attributes:
-      obs: [..., O], raw.
-      action: [..., A], in [-1, 1].
-      reward: [...], unscaled.
-      kind: [...] int8; those that are `CUT` do not count.
-      next_obs: [..., O], raw; of no meaning but where the episode goes on.
+      obs: [B, O], raw.
+      action: [B, A], in [-1, 1].
+      reward: [B], of the steps up to `next_obs` or the end of the task, discounted, unscaled.
+      discount: [B], how much what follows `next_obs` counts; 0 where the task has ended.
+      is_known: [B] bool; those of which nothing is known do not count.
+      next_obs: [B, O], raw.
     """
 
     obs: Array
     action: Array
     reward: Array
-    kind: Array
+    discount: Array
+    is_known: Array
     next_obs: Array
 
 
-def empty_replay(spec: EnvSpec, num_steps: int, num_envs: int) -> Replay:
+def empty_replay(spec: EnvSpec, num_steps: int, num_envs: int, dtype: DTypeLike) -> Replay:
     """A ring of `num_steps` rows without transitions."""
     shape = num_steps, num_envs
     return Replay(
-        obs=jnp.zeros((*shape, spec.obs_size), jnp.float32),
-        action=jnp.zeros((*shape, spec.action_size), jnp.float32),
+        obs=jnp.zeros((*shape, spec.obs_size), dtype),
+        action=jnp.zeros((*shape, spec.action_size), dtype),
         reward=jnp.zeros(shape, jnp.float32),
         kind=jnp.full(shape, CUT, jnp.int8),
         # An array each: both are donated.
         head=jnp.zeros((), jnp.int32),
         filled=jnp.zeros((), jnp.int32),
+        units=no_samples((spec.obs_size,)),
     )
+
+
+def size_bytes(replay: Replay) -> int:
+    """Of the ring in memory."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(replay))
 
 
 def kind_of(terminated: Array, truncated: Array, is_diverged: Array) -> Array:
@@ -78,15 +96,39 @@ def kind_of(terminated: Array, truncated: Array, is_diverged: Array) -> Array:
     return jnp.where(is_diverged, CUT, kind).astype(jnp.int8)
 
 
+def with_units(replay: Replay, moments: Moments) -> Replay:
+    """The ring, begun anew in units of `moments` where it needs units and has none.
+
+    Float16 has 11 bits: of a height of 9.81 +- 0.01, raw, it would keep one digit. So what is
+    written until there are statistics is not learnt from.
+    """
+    if replay.obs.dtype == jnp.float32:
+        return replay
+    is_new = replay.units.count == 0
+    moments = with_std_floor(moments, _LEAST_UNIT)
+    units = jax.tree.map(lambda new, old: jnp.where(is_new, new, old), moments, replay.units)
+    head, filled = (jnp.where(is_new, 0, number) for number in (replay.head, replay.filled))
+    return replay._replace(units=units, head=head, filled=filled)
+
+
+def can_learn(replay: Replay, learning_starts: int) -> Array:
+    """Whether [] there are so many rows to learn from."""
+    has_units = replay.obs.dtype == jnp.float32 or replay.units.count > 0
+    return (replay.filled >= learning_starts) & has_units
+
+
 def insert(replay: Replay, obs: Array, action: Array, reward: Array, kind: Array) -> Replay:
-    """The ring with T more rows [T, N, ...], of which S is a multiple."""
+    """The ring with T more rows [T, N, ...], of which S is a multiple; `obs` are raw."""
     num_steps, length = len(replay.obs), len(obs)
+    # Normalised observations are clipped far below; an infinity would become NaN there.
+    most = float(jnp.finfo(replay.obs.dtype).max)
+    obs = jnp.clip(in_units(replay.units, obs), -most, most)
 
     def written(ring: Array, rows: Array) -> Array:
         start = (replay.head, *(0,) * (ring.ndim - 1))
         return jax.lax.dynamic_update_slice(ring, rows.astype(ring.dtype), start)
 
-    return Replay(
+    return replay._replace(
         obs=written(replay.obs, obs),
         action=written(replay.action, action),
         reward=written(replay.reward, reward),
@@ -96,20 +138,50 @@ def insert(replay: Replay, obs: Array, action: Array, reward: Array, kind: Array
     )
 
 
-def sample(replay: Replay, key: PRNGKey, batch_size: int) -> Transitions:
+def sample(
+    replay: Replay, key: PRNGKey, batch_size: int, n_step: int, discounting: float
+) -> Transitions:
     """`batch_size` transitions, uniformly of all; consumes `key`.
 
-    Never of the newest row, whose next observation is not there yet.
+    Each sums the rewards of up to `n_step` steps: fewer where the episode ends, or where the next
+    observation is not known. None begins with the newest row.
     """
     num_steps, num_envs = replay.reward.shape
     age_key, env_key = jax.random.split(key)
     age = jax.random.randint(age_key, (batch_size,), 2, jnp.maximum(replay.filled, 2) + 1)
-    row = (replay.head - age) % num_steps
     env = jax.random.randint(env_key, (batch_size,), 0, num_envs)
+    first, steps = replay.head - age, jnp.arange(n_step)
+    rows = (first[:, None] + steps) % num_steps, env[:, None]
+    is_newest = age[:, None] - steps <= 1  # Or not written yet, which is behind it.
+    kind = replay.kind[rows]
+    kind = jnp.where(is_newest & (kind == GOES_ON), CUT, kind)
+    goes_on = kind == GOES_ON
+    # All steps before it go on.
+    is_reached = jnp.cumprod(jnp.roll(goes_on, 1, axis=1).at[:, 0].set(True), axis=1) > 0
+    counts = is_reached & (kind != CUT)
+    factors = discounting ** jnp.arange(n_step + 1, dtype=jnp.float32)
+    rewards = jnp.where(counts, factors[:-1] * replay.reward[rows], 0.0)
+    num_counted = jnp.sum(counts, axis=1)
+    has_ended = jnp.any(is_reached & (kind == TERMINATED), axis=1)
     return Transitions(
-        obs=replay.obs[row, env],
-        action=replay.action[row, env],
-        reward=replay.reward[row, env],
-        kind=replay.kind[row, env],
-        next_obs=replay.obs[(row + 1) % num_steps, env],
+        obs=_observations(replay, first % num_steps, env),
+        action=replay.action[first % num_steps, env].astype(jnp.float32),
+        reward=jnp.sum(rewards, axis=1),
+        discount=jnp.where(has_ended, 0.0, factors[num_counted]),
+        is_known=num_counted > 0,
+        next_obs=_observations(replay, (first + num_counted) % num_steps, env),
     )
+
+
+def sample_obs(replay: Replay, key: PRNGKey, batch_size: int) -> Array:
+    """Raw observations [B, O], uniformly of all; consumes `key`."""
+    num_steps, num_envs = replay.reward.shape
+    age_key, env_key = jax.random.split(key)
+    age = jax.random.randint(age_key, (batch_size,), 1, jnp.maximum(replay.filled, 1) + 1)
+    env = jax.random.randint(env_key, (batch_size,), 0, num_envs)
+    return _observations(replay, (replay.head - age) % num_steps, env)
+
+
+def _observations(replay: Replay, row: Array, env: Array) -> Array:
+    """[B, O] float32, raw."""
+    return from_units(replay.units, replay.obs[row, env].astype(jnp.float32))

@@ -1,5 +1,9 @@
 """An iteration of SAC: T times a step into the replay and updates on batches drawn from it.
 
+The policy learns once after every `policy_every` updates of the critics: several times in a round,
+or once after several rounds. Which is known when the program is made, so that no gradient is
+computed that is not used, also where several runs share a program.
+
 Agents and learner take turns in one program. Where several GMIs train, each has its own
 environments and its own replay, and they average the gradients of their batches.
 """
@@ -17,9 +21,10 @@ from gmijax.learning.algorithm import Algorithm, IterationMetrics
 from gmijax.learning.learner import acting_weights, finish_iteration, make_learner, policy_figures
 from gmijax.learning.normalize import moments_of, without_outliers
 from gmijax.learning.unroll import RolloutSums, act, count, merge_sums, outcome_of, unroll
-from gmijax.sac.replay import insert, kind_of
-from gmijax.sac.state import Memory, SacLearner, SacLosses, SacState, begin, init, num_averaged
-from gmijax.sac.updates import update
+from gmijax.sac.losses import CriticFigures
+from gmijax.sac.replay import Replay, can_learn, insert, kind_of, size_bytes, with_units
+from gmijax.sac.state import Memory, SacLearner, SacState, begin, init, num_averaged
+from gmijax.sac.updates import Learnt, losses_of, update_critics, update_policy
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
 from gmijax.types import Array, PRNGKey, PyTree
 
@@ -35,9 +40,12 @@ def iterate(
     """See `gmijax.learning.algorithm.Iterate`: T rounds of a step and its updates."""
     config = learner.config
     key = jax.random.fold_in(jax.random.fold_in(state.key, state.iteration), collectives.rank())
-    keys = jax.random.split(key, config.unroll_length)
-    one_round = partial(_round, env, learner, collectives, model)
-    (state, memory), (stats, losses, is_due) = jax.lax.scan(one_round, (state, memory), keys)
+    memory = memory._replace(replay=with_units(memory.replay, state.obs_moments))
+    length = config.rounds_per_turn
+    keys = jax.random.split(key, (config.unroll_length // length, length + 1))
+    turn = partial(_turn, env, learner, collectives, model)
+    (state, memory), (stats, losses) = jax.lax.scan(turn, (state, memory), keys)
+    stats = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), stats)
     everyone = collectives.all_gather(merge_sums(stats), after=losses)
     seen, counts = merge_sums(everyone)
     state = finish_iteration(learner, state, seen)
@@ -45,11 +53,27 @@ def iterate(
         **policy_figures(state),
         "policy/temperature": jnp.exp(state.log_temperature),
         "replay/steps": memory.replay.filled.astype(jnp.float32),
+        "replay/mib": jnp.asarray(size_bytes(memory.replay) / 2**20, jnp.float32),
     }
-    means = jax.tree.map(jnp.mean, losses)
-    of_policy = jnp.sum(losses.policy_loss) / jnp.maximum(jnp.sum(is_due), 1.0)
-    means = means._replace(policy_loss=of_policy)
-    return state, memory, IterationMetrics(counts, means, figures, {})
+    return state, memory, IterationMetrics(counts, losses_of(losses), figures, {})
+
+
+def _turn(
+    env: BatchedEnv,
+    learner: SacLearner,
+    collectives: Collectives,
+    model: PyTree,
+    before: tuple[SacState, Memory],
+    keys: PRNGKey,
+) -> tuple[tuple[SacState, Memory], tuple[RolloutSums, Learnt]]:
+    """As many rounds as an update of the policy is made after; `keys` [rounds + 1]."""
+    one_round = partial(_round, env, learner, collectives, model)
+    (state, memory), (stats, learnt) = jax.lax.scan(one_round, before, keys[1:])
+    if learner.config.updates_per_step < learner.config.policy_every:
+        after, loss = update_policy(learner, collectives, memory.replay, state, keys[0])
+        state = _where(learnt.is_ready[-1], after, state)
+        learnt = learnt._replace(policy_loss=loss)
+    return (state, memory), (stats, learnt)
 
 
 def _round(
@@ -59,18 +83,39 @@ def _round(
     model: PyTree,
     before: tuple[SacState, Memory],
     key: PRNGKey,
-) -> tuple[tuple[SacState, Memory], tuple[RolloutSums, SacLosses, Array]]:
+) -> tuple[tuple[SacState, Memory], tuple[RolloutSums, Learnt]]:
     """A step of all environments, and the updates after it."""
-    config, (state, memory) = learner.config, before
+    state, memory = before
     memory, stats = _act(env, learner, model, state, memory)
-    step = partial(update, learner, collectives, memory.replay)
-    keys = jax.random.split(key, config.updates_per_step)
-    after, (losses, is_due) = jax.lax.scan(step, state, keys)
+    after, figures, policy_loss = _learn(learner, collectives, memory.replay, state, key)
     # The same on all GMIs, whose replays fill alike. Before, there is too little to learn from.
-    is_ready = memory.replay.filled >= config.learning_starts
-    state = jax.tree.map(lambda new, old: jnp.where(is_ready, new, old), after, state)
-    losses = jax.tree.map(lambda x: jnp.where(is_ready, x, 0.0), losses)
-    return (state, memory), (stats, losses, is_due & is_ready)
+    is_ready = can_learn(memory.replay, learner.config.learning_starts)
+    learnt = Learnt(figures, policy_loss, is_ready)
+    return (_where(is_ready, after, state), memory), (stats, learnt)
+
+
+def _learn(
+    learner: SacLearner, collectives: Collectives, replay: Replay, state: SacState, key: PRNGKey
+) -> tuple[SacState, CriticFigures, Array | None]:
+    """The updates after a step: of the policy too, if its turn comes as often."""
+    num_updates, every = learner.config.updates_per_step, learner.config.policy_every
+    of_critics = partial(update_critics, learner, collectives, replay)
+    if num_updates < every:
+        state, figures = jax.lax.scan(of_critics, state, jax.random.split(key, num_updates))
+        return state, figures, None
+
+    def turn(state: SacState, keys: PRNGKey) -> tuple[SacState, tuple[CriticFigures, Array]]:
+        state, figures = jax.lax.scan(of_critics, state, keys[1:])
+        state, loss = update_policy(learner, collectives, replay, state, keys[0])
+        return state, (figures, loss)
+
+    keys = jax.random.split(key, (num_updates // every, every + 1))
+    state, (figures, losses) = jax.lax.scan(turn, state, keys)
+    return state, figures, losses
+
+
+def _where(condition: Array, new: SacState, old: SacState) -> SacState:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
 def _act(
@@ -105,5 +150,7 @@ SAC = Algorithm(
     num_averaged=num_averaged,
     begin=begin,
     envs=lambda memory: memory.envs,
+    replay=lambda learner, memory: memory.replay if learner.config.save_replay else None,
+    with_replay=lambda memory, replay: memory._replace(replay=replay),
     learned=lambda state: (state.params, state.critics, state.targets, state.log_temperature),
 )

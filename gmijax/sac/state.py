@@ -13,6 +13,7 @@ from gmijax.learning.learner import Learner, make_learner
 from gmijax.learning.normalize import Moments, no_samples
 from gmijax.learning.policy import ActorCriticParams
 from gmijax.sac.critics import critics_of
+from gmijax.sac.losses import CriticFigures
 from gmijax.sac.replay import Replay, empty_replay
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState
@@ -61,23 +62,6 @@ class Memory(NamedTuple):
     replay: Replay
 
 
-class SacLosses(NamedTuple):
-    """Means over an iteration's updates, [] float32 each.
-
-    Attributes:
-      critic_loss: cross-entropy, summed over both critics.
-      policy_loss: of those updates in which the policy learns.
-      entropy: of the policy in next states, in nats.
-      end_atoms: share of the targets at the ends of `value_range`; more than 0.01 says that the
-        range is too small for the rewards.
-    """
-
-    critic_loss: Array
-    policy_loss: Array
-    entropy: Array
-    end_atoms: Array
-
-
 def init(learner: SacLearner, obs_size: int, key: PRNGKey) -> SacState:
     """The first state; consumes `key`."""
     config, networks = learner.config, learner.networks
@@ -106,8 +90,9 @@ def init(learner: SacLearner, obs_size: int, key: PRNGKey) -> SacState:
 
 def begin(learner: SacLearner, env: BatchedEnv, envs: BatchState) -> Memory:
     """The environments with an empty replay."""
-    num_envs = envs.env.reward.shape[0]
-    return Memory(envs, empty_replay(env.spec, learner.config.replay_steps, num_envs))
+    config, num_envs = learner.config, envs.env.reward.shape[0]
+    dtype = jnp.dtype(config.replay_precision)
+    return Memory(envs, empty_replay(env.spec, config.replay_steps, num_envs, dtype))
 
 
 def optimizers(config: SacConfig) -> tuple[optax.GradientTransformation, ...]:
@@ -120,7 +105,10 @@ def optimizers(config: SacConfig) -> tuple[optax.GradientTransformation, ...]:
 
 def num_averaged(spec: EnvSpec, config: SacConfig) -> int:
     """See `gmijax.learning.algorithm.Algorithm`."""
+    # An update is of the critics and the temperature, or of the policy.
     learner = make_learner(spec, config)
     state = jax.eval_shape(lambda: init(learner, spec.obs_size, jax.random.key(0)))
-    learned = state.critics, state.params, state.log_temperature
-    return sum(leaf.size for leaf in jax.tree.leaves(learned)) + len(SacLosses._fields)
+    critics, policy = (
+        sum(leaf.size for leaf in jax.tree.leaves(tree)) for tree in (state.critics, state.params)
+    )
+    return max(critics + 1 + len(CriticFigures._fields), policy + 1)

@@ -1,9 +1,12 @@
-"""An update of SAC: a batch of the replay, gradients, their mean over all GMIs, a step."""
+"""Updates of SAC: a batch of the replay, gradients, their mean over all GMIs, a step.
+
+Those of the critics and of the policy are apart; `gmijax.sac.sac` says when each is made.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,99 +15,136 @@ import optax
 from gmijax.collectives.interface import Collectives
 from gmijax.learning.learner import acting_moments
 from gmijax.learning.normalize import normalize
-from gmijax.learning.policy import ActorCriticParams
-from gmijax.sac.critics import Critics, critics_of
+from gmijax.sac.critics import critics_of
 from gmijax.sac.losses import (
     Batch,
+    CriticFigures,
     critic_loss,
     policy_loss,
     sampled_action,
     target_probs,
     temperature_loss,
 )
-from gmijax.sac.replay import Replay, sample
-from gmijax.sac.state import SacLearner, SacLosses, SacState, optimizers
+from gmijax.sac.replay import Replay, sample, sample_obs
+from gmijax.sac.state import SacLearner, SacState, optimizers
 from gmijax.types import Array, PRNGKey, PyTree
 
 _ENTROPY_OF_UNIT_STD = 0.5 * math.log(2.0 * math.pi * math.e)
 
 
-def update(
-    learner: SacLearner,
-    collectives: Collectives,
-    replay: Replay,
-    state: SacState,
-    key: PRNGKey,
-) -> tuple[SacState, tuple[SacLosses, Array]]:
-    """One update of the critics and the temperature, and of the policy if it is its turn.
+class Learnt(NamedTuple):
+    """Of the updates of several rounds, with leading axes for what they were made in.
 
-    Returns also whether it was. Where several runs share a program the gradient of the policy is
-    computed in every update, and used when it is its turn.
+    Attributes:
+      figures: of the critics.
+      policy_loss: None where the policy has not learnt.
+      is_ready: whether updates counted.
     """
-    config, critics = learner.config, critics_of(learner.config)
-    batch_key, next_key, policy_key = jax.random.split(key, 3)
+
+    figures: CriticFigures
+    policy_loss: Array | None
+    is_ready: Array
+
+
+class SacLosses(NamedTuple):
+    """Means over an iteration's updates, [] float32 each; 0 where there are none.
+
+    Attributes:
+      critic_loss: cross-entropy, summed over both critics.
+      policy_loss: of its own updates.
+      entropy: of the policy in next states, in nats.
+      end_atoms: share of the targets at the ends of `value_range`; more than 0.01 says that the
+        range is too small for the rewards.
+    """
+
+    critic_loss: Array
+    policy_loss: Array
+    entropy: Array
+    end_atoms: Array
+
+
+def losses_of(learnt: Learnt) -> SacLosses:
+    """Of what was learnt in an iteration: turns of the policy and their rounds, [T', T'']."""
+
+    def mean(values: Array, is_ready: Array) -> Array:
+        each = jnp.mean(values.reshape(*is_ready.shape, -1), axis=-1)
+        return jnp.sum(jnp.where(is_ready, each, 0.0)) / jnp.maximum(jnp.sum(is_ready), 1)
+
+    figures, policy_loss, is_ready = learnt
+    assert policy_loss is not None
+    means = jax.tree.map(lambda values: mean(values, is_ready), figures)
+    # Once in a turn, after its last round; or in every round.
+    when = is_ready[:, -1] if policy_loss.ndim == 1 else is_ready
+    return SacLosses(policy_loss=mean(policy_loss, when), **means._asdict())
+
+
+def update_critics(
+    learner: SacLearner, collectives: Collectives, replay: Replay, state: SacState, key: PRNGKey
+) -> tuple[SacState, CriticFigures]:
+    """One update of both critics, their targets and the temperature; consumes `key`."""
+    batch_key, next_key = jax.random.split(key)
     batch = _batch(learner, state, replay, batch_key)
-    is_due = state.updates % config.policy_every == 0
-    own = _gradients(learner, critics, state, batch, is_due, next_key, policy_key)
-    (critic_grads, policy_grads, temperature_grad), losses = collectives.mean(own)
-    of_critics, of_policy, of_temperature = optimizers(config)
-    new_critics, critic_opt = _step(
-        of_critics, state, state.opt_states[0], critic_grads, state.critics
+    own = _gradients(learner, state, batch, next_key)
+    (critic_grads, temperature_grad), figures = collectives.mean(own)
+    of_critics, of_policy, of_temperature = state.opt_states
+    optimizer, _, temperature_optimizer = optimizers(learner.config)
+    critics, of_critics = _step(optimizer, state, of_critics, critic_grads, state.critics)
+    log_temperature, of_temperature = _step(
+        temperature_optimizer, state, of_temperature, temperature_grad, state.log_temperature
     )
-    new_params, policy_opt = _step(
-        of_policy, state, state.opt_states[1], policy_grads, state.params
-    )
-    new_temperature, temperature_opt = _step(
-        of_temperature, state, state.opt_states[2], temperature_grad, state.log_temperature
-    )
-    params, policy_opt = jax.tree.map(
-        lambda new, old: jnp.where(is_due, new, old),
-        (new_params, policy_opt),
-        (state.params, state.opt_states[1]),
-    )
-    targets = jax.tree.map(
-        lambda slow, new: slow + config.target_rate * (new - slow), state.targets, new_critics
-    )
+    rate = learner.config.target_rate
     state = state._replace(
-        params=params,
-        opt_states=(critic_opt, policy_opt, temperature_opt),
-        critics=new_critics,
-        targets=targets,
-        log_temperature=new_temperature,
+        opt_states=(of_critics, of_policy, of_temperature),
+        critics=critics,
+        targets=jax.tree.map(lambda slow, new: slow + rate * (new - slow), state.targets, critics),
+        log_temperature=log_temperature,
         updates=state.updates + 1,
     )
-    return state, (losses, is_due)
+    return state, figures
+
+
+def update_policy(
+    learner: SacLearner, collectives: Collectives, replay: Replay, state: SacState, key: PRNGKey
+) -> tuple[SacState, Array]:
+    """One update of the policy, in states of a batch of its own; its loss []; consumes `key`."""
+    batch_key, action_key = jax.random.split(key)
+    config = learner.config
+    raw = sample_obs(replay, batch_key, config.batch_size)
+    own = jax.value_and_grad(policy_loss)(
+        *(state.params, learner, critics_of(config), state.critics),
+        *(normalize(acting_moments(config, state), raw), jnp.exp(state.log_temperature)),
+        action_key,
+    )
+    loss, grads = collectives.mean(own)
+    of_critics, of_policy, of_temperature = state.opt_states
+    _, optimizer, _ = optimizers(config)
+    params, of_policy = _step(optimizer, state, of_policy, grads, state.params)
+    opt_states = of_critics, of_policy, of_temperature
+    return state._replace(params=params, opt_states=opt_states), loss
 
 
 def _batch(learner: SacLearner, state: SacState, replay: Replay, key: PRNGKey) -> Batch:
     """Transitions of this GMI's replay, normalised by what is known now."""
     config = learner.config
     moments = acting_moments(config, state)
-    drawn = sample(replay, key, config.batch_size)
+    drawn = sample(replay, key, config.batch_size, config.n_step, config.discounting)
     return Batch(
         obs=normalize(moments, drawn.obs),
         action=drawn.action,
         reward=config.reward_scaling * drawn.reward,
-        kind=drawn.kind,
+        discount=drawn.discount,
+        is_known=drawn.is_known,
         next_obs=normalize(moments, drawn.next_obs),
     )
 
 
 def _gradients(
-    learner: SacLearner,
-    critics: Critics,
-    state: SacState,
-    batch: Batch,
-    is_due: Array,
-    next_key: PRNGKey,
-    policy_key: PRNGKey,
-) -> tuple[tuple[PyTree, ActorCriticParams, Array], SacLosses]:
-    """Of critics, policy (zeros if it is not its turn) and temperature; and the losses."""
-    temperature = jnp.exp(state.log_temperature)
-    next_action, next_log_prob = sampled_action(learner, state.params, batch.next_obs, next_key)
-    wanted = target_probs(
-        critics, state.targets, learner.config, batch, next_action, next_log_prob, temperature
-    )
+    learner: SacLearner, state: SacState, batch: Batch, key: PRNGKey
+) -> tuple[tuple[PyTree, Array], CriticFigures]:
+    """Of critics and temperature; and figures."""
+    critics, temperature = critics_of(learner.config), jnp.exp(state.log_temperature)
+    next_action, next_log_prob = sampled_action(learner, state.params, batch.next_obs, key)
+    wanted = target_probs(critics, state.targets, batch, next_action, next_log_prob, temperature)
     (loss, at_ends), critic_grads = jax.value_and_grad(critic_loss, has_aux=True)(
         state.critics, critics, batch, wanted
     )
@@ -112,19 +152,8 @@ def _gradients(
     temperature_grad = jax.grad(temperature_loss)(
         state.log_temperature, next_log_prob, target_entropy(learner)
     )
-
-    def policy_step() -> tuple[Array, ActorCriticParams]:
-        return jax.value_and_grad(policy_loss)(
-            *(state.params, learner, critics, state.critics),
-            *(batch.obs, temperature, policy_key),
-        )
-
-    def no_step() -> tuple[Array, ActorCriticParams]:
-        return jnp.zeros(()), jax.tree.map(jnp.zeros_like, state.params)
-
-    of_policy, policy_grads = jax.lax.cond(is_due, policy_step, no_step)
-    losses = SacLosses(loss, of_policy, -jnp.mean(next_log_prob), at_ends)
-    return (critic_grads, policy_grads, temperature_grad), losses
+    figures = CriticFigures(loss, -jnp.mean(next_log_prob), at_ends)
+    return (critic_grads, temperature_grad), figures
 
 
 def target_entropy(learner: SacLearner) -> float:

@@ -24,10 +24,14 @@ from gmijax.learning.algorithm import Algorithm, iterate_all, load_algorithm
 from gmijax.learning.checkpoint import (
     checkpoint_meta,
     finish_checkpoint,
+    has_replay,
     on_host,
+    restore_envs,
     restore_learner,
+    restore_replay,
     save_learner,
 )
+from gmijax.learning.checkpoint_saver import CheckpointSaver, Part
 from gmijax.learning.episode_window import Standing
 from gmijax.learning.learner import Learner, TrainState, acting_weights
 from gmijax.learning.policy_file import save_policy
@@ -42,6 +46,7 @@ ROWS: dict[str, tuple[str, ...]] = {
     "sac": (
         *("algo.batch_size=16", "algo.critic_hidden_layer_sizes=[16]", "algo.num_atoms=11"),
         *("algo.replay_steps=8", "algo.learning_starts=4", "algo.updates_per_step=1"),
+        *("algo.replay_precision=float16", "algo.save_replay=true", "algo.n_step=2"),
     ),
 }
 """What each algorithm needs beside its defaults."""
@@ -117,7 +122,7 @@ def test_it_averages_what_it_says(case: Case) -> None:
 
     iterate = partial(case.algorithm.iterate, ENV, case.learner, Counting(), ENV.model)
     jax.eval_shape(iterate, case.first(0), case.memory())
-    assert set(sizes) == {case.algorithm.num_averaged(ENV.spec, case.config.algo)}
+    assert max(sizes) == case.algorithm.num_averaged(ENV.spec, case.config.algo)
 
 
 def test_runs_that_share_a_program_learn_what_they_do_alone(case: Case) -> None:
@@ -136,6 +141,33 @@ def test_runs_that_share_a_program_learn_what_they_do_alone(case: Case) -> None:
         expected, _, _ = alone(state, own)
         mine = jax.tree.map(lambda leaf, k=number: leaf[k], found.params)
         chex.assert_trees_all_close(mine, expected.params, rtol=1e-4, atol=1e-5)
+
+
+def test_it_goes_on_from_a_checkpoint_as_if_it_had_not_stopped(case: Case, tmp_path: Path) -> None:
+    algorithm, learner = case.algorithm, case.learner
+    iterate: Any = jax.jit(partial(algorithm.iterate, ENV, learner, LocalCollectives(), ENV.model))
+    state, memory = case.first(5), case.memory(5)
+    for _ in range(3):
+        state, memory, _ = iterate(state, memory)
+    run = RunPaths(tmp_path)
+    write_json(run.config, to_dict(case.config))
+    saver = CheckpointSaver(0, SingleRankCommunicator(), None)
+    meta = checkpoint_meta(case.config, 96, 1, Standing())
+    parts = state, algorithm.envs(memory), algorithm.replay(learner, memory)
+    own, envs, replay = map(on_host, parts)
+    saver.begin([Part(run, meta, own, envs, replay=replay)])
+    saver.finish()
+    saver.stop()
+    checkpoint = run.checkpoint(96)
+    again = restore_learner(checkpoint, case.first(6))
+    new = case.memory(6)
+    other = algorithm.begin(learner, ENV, restore_envs(checkpoint, 0, algorithm.envs(new)))
+    assert has_replay(checkpoint, 0) == (replay is not None)
+    if replay is not None:
+        template = algorithm.replay(learner, new)
+        other = algorithm.with_replay(other, restore_replay(checkpoint, 0, template))
+    expected, found = iterate(state, memory), iterate(again, other)
+    chex.assert_trees_all_equal(on_host(found), on_host(expected))
 
 
 def test_its_checkpoint_is_restored_and_acts(case: Case, tmp_path: Path) -> None:

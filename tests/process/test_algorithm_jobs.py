@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,7 @@ def test_two_gmis_learn_by_sac_and_fill_the_replay_anew_when_they_go_on(tmp_path
     half = sorted((tmp_path / "run" / "checkpoints").iterdir())[0]
     done = train(f"run.resume={half}", "run.dir=again", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert "the replay of 384 transitions is not in the checkpoint" in done.stdout
     for run, first in (("run", 4.0), ("again", 4.0)):
         lines = [
             json.loads(x) for x in (tmp_path / run / "metrics.jsonl").read_text().splitlines()
@@ -59,3 +61,29 @@ def test_two_gmis_learn_by_sac_and_fill_the_replay_anew_when_they_go_on(tmp_path
         assert lines[-1]["loss/critic_loss"] > 0
         own = lines if run == "run" else lines[3:]
         assert own[0]["replay/steps"] == first
+
+
+@pytest.mark.timeout(300)
+def test_a_replay_that_is_saved_goes_on_with_its_run(tmp_path: Path) -> None:
+    saved = ("algo.save_replay=true", "algo.replay_precision=float16", "algo.n_step=2")
+    line = ("plan.gpus=2", "run.checkpoint_every=3", "num_timesteps=1024")
+    done = train(*BASE, *SAC, *saved, *line, "run.dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    half = sorted((tmp_path / "run" / "checkpoints").iterdir())[0]
+    assert {path.name for path in half.glob("replay_*")} == {"replay_0", "replay_1"}
+    done = train(f"run.resume={half}", "run.dir=again", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "the replay of" not in done.stdout
+    again, whole = (learner_arrays(tmp_path / run) for run in ("again", "run"))
+    for array, other in zip(again, whole, strict=True):
+        np.testing.assert_array_equal(array, other)
+    # With another size it does not fit; a larger one than there is memory is not begun.
+    for key, said in (
+        ("algo.replay_steps=32", "replay_0 does not fit this job"),
+        ("algo.replay_steps=16000000000", "16000000000 steps of each (algo.replay_steps)"),
+    ):
+        done = train(f"run.resume={half}", "run.dir=bad", key, cwd=tmp_path)
+        assert done.returncode == 2
+        assert said in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+        shutil.rmtree(tmp_path / "bad")

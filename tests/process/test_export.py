@@ -14,6 +14,8 @@ from made_checkpoint import ENV_STEPS, make_run
 from training_jobs import child_environment, train
 
 import gmijax
+from gmijax.deploy.files import onnx_content, stablehlo_content
+from gmijax.deploy.trained import trained_policy
 from gmijax.runs.folder import ExportPaths
 
 ROOT = Path(__file__).parents[2]
@@ -45,6 +47,22 @@ def test_onnx_runtime_acts_as_jax_does(exported: ExportPaths):
     assert np.abs(onnx - trained).max() < 1e-5
     assert np.abs(stablehlo - trained).max() < 1e-6
     assert 0.05 < (np.abs(trained) == 1.0).mean() < 0.95, "some are clipped, and some are not"
+
+
+def test_layer_norm_and_silu_are_exported_too(tmp_path: Path):
+    run = make_run(tmp_path / "run", "algo.activation=layer_norm_silu")
+    policy = trained_policy(run.checkpoint(ENV_STEPS))
+    obs = np.random.default_rng(0).normal(scale=5.0, size=(1000, 24)).astype(np.float32)
+    wanted = gmijax.load_policy(run.root)(obs)
+    for name, content in (
+        ("onnx", onnx_content(policy, {})),
+        ("stablehlo", stablehlo_content(policy)),
+    ):
+        (tmp_path / f"policy.{name}").write_bytes(content)
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
+    (found,) = session.run(None, {"obs": obs})
+    assert np.abs(np.asarray(found) - wanted).max() < 1e-5
+    assert np.abs(gmijax.load_policy(tmp_path / "policy.stablehlo")(obs) - wanted).max() < 1e-6
 
 
 def test_the_onnx_file_has_one_input_and_one_output_of_any_length(exported: ExportPaths):

@@ -127,10 +127,17 @@ def test_the_derivative_of_elu_comes_from_its_output_and_is_the_same() -> None:
     np.testing.assert_array_equal(mine, theirs)
 
 
-def test_hidden_layers_compute_in_bfloat16_and_all_else_in_float32(params) -> None:
+@pytest.mark.parametrize("activation", ["elu", "layer_norm_silu"])
+def test_hidden_layers_compute_in_bfloat16_and_all_else_in_float32(activation: str) -> None:
     assert NETWORKS.value is not None
-    policy, value = (net.clone(dtype="bfloat16") for net in (NETWORKS.policy, NETWORKS.value))
-    half = NETWORKS._replace(policy=policy, value=value)
+    whole, half = (
+        NETWORKS._replace(
+            policy=NETWORKS.policy.clone(dtype=dtype, activation=activation),
+            value=NETWORKS.value.clone(dtype=dtype, activation=activation),
+        )
+        for dtype in ("float32", "bfloat16")
+    )
+    params = whole.init(jax.random.key(0), O)
     obs = jax.random.normal(jax.random.key(1), (20_000, O))  # Gradients are sums of many.
 
     def loss(params, networks):
@@ -138,7 +145,7 @@ def test_hidden_layers_compute_in_bfloat16_and_all_else_in_float32(params) -> No
         return jnp.mean(values + values**2), (values, networks.output(params, obs))
 
     derived = jax.jit(jax.grad(loss, has_aux=True), static_argnums=1)
-    (mine, outputs), (theirs, exact) = derived(params, half), derived(params, NETWORKS)
+    (mine, outputs), (theirs, exact) = derived(params, half), derived(params, whole)
     assert not jnp.array_equal(outputs[0], exact[0])
     pairs = zip(*map(jax.tree.leaves, ((outputs, mine.value), (exact, theirs.value))), strict=True)
     for a, b in pairs:

@@ -15,10 +15,24 @@ from toy_env import point_mass
 import gmijax
 from gmijax.collectives.program import LocalCollectives
 from gmijax.errors import ConfigError
+from gmijax.learning.normalize import moments_of, no_samples
 from gmijax.learning.start import begin_episodes
+from gmijax.sac import sac
 from gmijax.sac.critics import critics_of, projected
 from gmijax.sac.losses import Batch, critic_loss, target_probs, temperature_loss
-from gmijax.sac.replay import CUT, GOES_ON, TERMINATED, empty_replay, insert, kind_of, sample
+from gmijax.sac.replay import (
+    CUT,
+    GOES_ON,
+    TERMINATED,
+    Replay,
+    can_learn,
+    empty_replay,
+    insert,
+    kind_of,
+    sample,
+    sample_obs,
+    with_units,
+)
 from gmijax.sac.sac import SAC
 from gmijax.sac.updates import target_entropy
 from gmijax.sim.interface import EnvSpec
@@ -28,7 +42,7 @@ TINY = (
     *("env=ball_balance", "algo=sac", "num_envs=16", "algo.batch_size=64"),
     *("algo.critic_hidden_layer_sizes=[32,32]", "algo.policy_hidden_layer_sizes=[32,32]"),
     *("algo.replay_steps=64", "algo.updates_per_step=2", "algo.reward_scaling=0.5"),
-    "algo.unroll_length=1",
+    *("algo.unroll_length=1", "algo.policy_every=2"),
 )
 
 
@@ -48,25 +62,138 @@ def rows(first: int, num: int, lengths: list[int]) -> tuple[np.ndarray, np.ndarr
     return obs, kind
 
 
+def ring_of(num_inserted: int, lengths: list[int], ring: int) -> Replay:
+    """Three rows at a time; the reward is the number of the step in its episode."""
+    spec = EnvSpec("x", 2, 1, 0.0, 0, ())
+    replay = empty_replay(spec, ring, len(lengths), jnp.float32)
+    for first in range(0, num_inserted, 3):
+        obs, kind = rows(first, 3, lengths)
+        replay = jax.jit(insert)(replay, obs, jnp.zeros((*kind.shape, 1)), obs[..., 1], kind)
+    return replay
+
+
+draw = jax.jit(sample, static_argnums=(2, 3, 4))
+
+
 @pytest.mark.parametrize("num_inserted", [6, 12, 15, 42])
 def test_no_transition_joins_two_episodes(num_inserted: int) -> None:
     lengths, ring = [3, 5, 7], 12
-    replay = empty_replay(EnvSpec("x", 2, 1, 0.0, 0, ()), ring, len(lengths))
-    for first in range(0, num_inserted, 3):
-        obs, kind = rows(first, 3, lengths)
-        zeros = jnp.zeros(kind.shape)
-        replay = jax.jit(insert)(replay, obs, zeros[..., None], zeros, kind)
+    replay = ring_of(num_inserted, lengths, ring)
     assert int(replay.filled) == min(num_inserted, ring)
-    drawn = jax.device_get(jax.jit(sample, static_argnums=2)(replay, jax.random.key(0), 4096))
-    goes_on = drawn.kind == GOES_ON
+    drawn = jax.device_get(draw(replay, jax.random.key(0), 4096, 1, 0.5))
+    goes_on = drawn.is_known & (drawn.discount > 0)
+    np.testing.assert_array_equal(drawn.discount[goes_on], 0.5)
     np.testing.assert_array_equal(drawn.next_obs[goes_on], drawn.obs[goes_on] + [0, 1])
     # All that is there is drawn, but for the newest row; and nothing else.
+    kind = np.where(drawn.is_known, np.where(drawn.discount > 0, GOES_ON, TERMINATED), CUT)
     expected, kinds = rows(max(0, num_inserted - ring), min(num_inserted, ring) - 1, lengths)
     pairs = [{(*obs, kind) for obs, kind in zip(*them, strict=True)} for them in (
-        (drawn.obs.tolist(), drawn.kind.tolist()),
+        (drawn.obs.tolist(), kind.tolist()),
         (expected.reshape(-1, 2).tolist(), kinds.reshape(-1).tolist()),
     )]  # fmt: skip
     assert pairs[0] == pairs[1]
+
+
+@pytest.mark.parametrize("n_step", [2, 3, 8])
+@pytest.mark.parametrize("num_inserted", [6, 12, 15, 42])
+def test_returns_of_several_steps_stay_in_their_episode(num_inserted: int, n_step: int) -> None:
+    lengths = [3, 5, 7]
+    drawn = jax.device_get(
+        draw(ring_of(num_inserted, lengths, 12), jax.random.key(0), 4096, n_step, 0.5)
+    )
+
+    def summed(first: int, steps: int) -> float:
+        return sum(0.5**i * (first + i) for i in range(steps))
+
+    known = [leaf[drawn.is_known] for leaf in (drawn.obs, drawn.next_obs, *drawn[2:4])]
+    for (episode, step), (next_episode, next_step), reward, discount in zip(*known, strict=True):
+        if discount > 0:
+            steps = int(next_step - step)
+            assert next_episode == episode
+            assert 1 <= steps <= n_step
+            assert (reward, discount) == (summed(step, steps), 0.5**steps)
+        else:
+            ends = [length - int(step) for length in lengths]
+            assert reward in [summed(step, left) for left in ends if 1 <= left <= n_step]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "reward", "discount", "next_obs"),
+    [
+        # Three steps go on: what follows the third.
+        ("ggggg", 1 + 2 / 2 + 4 / 4, 1 / 8, 3),
+        # The task ends in the first, second, third step; then in the fourth, which is not seen.
+        ("tgggg", 1, 0, None),
+        ("gtggg", 1 + 2 / 2, 0, None),
+        ("ggtgg", 1 + 2 / 2 + 4 / 4, 0, None),
+        ("gggtg", 1 + 2 / 2 + 4 / 4, 1 / 8, 3),
+        # Time runs out, or the simulation diverges: the state before is the last that is known.
+        ("cgggg", None, None, None),
+        ("gcggg", 1, 1 / 2, 1),
+        ("ggcgg", 1 + 2 / 2, 1 / 4, 2),
+        ("gggcg", 1 + 2 / 2 + 4 / 4, 1 / 8, 3),
+        # Whichever comes first.
+        ("gctgg", 1, 1 / 2, 1),
+        ("gtcgg", 1 + 2 / 2, 0, None),
+        # The newest row: what follows it is not known yet, but the end of the task is.
+        ("ggg", 1 + 2 / 2, 1 / 4, 2),
+        ("gg", 1, 1 / 2, 1),
+        ("gt", 1 + 2 / 2, 0, None),
+    ],
+)
+@pytest.mark.parametrize("wrapped", [0, 3])
+def test_a_target_of_three_steps_ends_where_nothing_more_is_known(
+    kinds: str, reward: float | None, discount: float | None, next_obs: int | None, wrapped: int
+) -> None:
+    before = np.full((wrapped, 1), TERMINATED, np.int8)
+    own = np.array([["gtc".index(kind)] for kind in kinds], np.int8)
+    kind = np.concatenate([before, own])
+    number = np.arange(-wrapped, len(kinds), dtype=np.float32)[:, None]
+    replay = empty_replay(EnvSpec("x", 1, 1, 0.0, 0, ()), 5, 1, jnp.float32)
+    for row in range(len(kind)):
+        obs = number[row : row + 1, :, None]
+        replay = insert(replay, obs, obs, 2.0 ** number[row : row + 1], kind[row : row + 1])
+    drawn = jax.device_get(draw(replay, jax.random.key(0), 512, 3, 0.5))
+    mine = np.flatnonzero(drawn.obs[:, 0] == 0.0)
+    assert len(mine) > 20
+    assert len(set(drawn.reward[mine])) == 1
+    found = jax.tree.map(lambda leaf: leaf[mine[0]], drawn)
+    assert bool(found.is_known) == (reward is not None)
+    if reward is not None:
+        assert (found.reward, found.discount) == (reward, discount)
+    if next_obs is not None:
+        assert found.next_obs == [next_obs]
+
+
+def test_half_precision_keeps_small_changes_and_forgets_what_has_no_units() -> None:
+    spec, rng = EnvSpec("x", 3, 1, 0.0, 0, ()), np.random.default_rng(0)
+    # A height, one that has never moved so far, and one that is beyond what float16 can hold.
+    scale, shift = np.array([0.01, 0.0, 1e6]), np.array([9.81, 0.5, 0.0])
+
+    def made(num: int) -> np.ndarray:
+        return (shift + scale * rng.normal(size=(num, 2, 3))).astype(np.float32)
+
+    def with_rows(replay: Replay, obs: np.ndarray) -> Replay:
+        zeros = jnp.zeros(obs.shape[:2])
+        return insert(replay, obs, zeros[..., None] + 0.3, zeros, zeros.astype(jnp.int8))
+
+    replay = with_units(empty_replay(spec, 8, 2, jnp.float16), no_samples((3,)))
+    replay = with_rows(replay, made(4))
+    assert not can_learn(replay, 4)
+    moments = moments_of(made(400), 2)
+    replay = with_units(replay, moments)
+    assert int(replay.filled) == 0
+    obs = made(4)
+    obs[2, 0, 1] = 400.0
+    replay = with_units(with_rows(replay, obs), moments_of(10.0 * obs, 2))  # Has them by now.
+    assert can_learn(replay, 4)
+    found = np.asarray(sample_obs(replay, jax.random.key(0), 256))
+    for row in found:
+        error = np.abs(obs.reshape(-1, 3) - row) / np.array([0.01, 400.0, 1e6])
+        assert error.max(axis=1).min() < 2e-3
+    drawn = draw(replay, jax.random.key(0), 64, 1, 0.5)
+    assert drawn.obs.dtype == drawn.action.dtype == jnp.float32
+    np.testing.assert_allclose(drawn.action, 0.3, rtol=1e-3)
 
 
 def test_what_follows_a_step() -> None:
@@ -92,12 +219,13 @@ def learner_of(*overrides: str) -> Any:
     return SAC.make_learner(ENV.spec, config)
 
 
-def batch_of(kind: int) -> Batch:
+def batch_of(discount: float, *, is_known: bool = True) -> Batch:
     ones = jnp.ones((2, 1))
-    return Batch(jnp.ones((2, 2)), ones, 3.0 * ones[:, 0], jnp.full(2, kind, jnp.int8), ones)
+    known = jnp.full(2, is_known)
+    return Batch(jnp.ones((2, 2)), ones, 3.0 * ones[:, 0], jnp.full(2, discount), known, ones)
 
 
-def test_targets_look_one_step_on_unless_the_task_has_ended() -> None:
+def test_targets_add_what_follows_unless_the_task_has_ended() -> None:
     class Sure:
         """Critics that expect a return of 2 for sure."""
 
@@ -107,13 +235,11 @@ def test_targets_look_one_step_on_unless_the_task_has_ended() -> None:
             return jnp.log(jnp.tile(jnp.eye(21)[12], (2, 2, 1)) + 1e-12)
 
     critics: Any = Sure()
-    config = learner_of("algo.discounting=0.5").config
-    for kind, wanted in ((GOES_ON, 3.0 + 0.5 * (2.0 - 0.1 * -4.0)), (TERMINATED, 3.0)):
+    for discount, wanted in ((0.5, 3.0 + 0.5 * (2.0 - 0.1 * -4.0)), (0.0, 3.0)):
         probs = target_probs(
             critics,
             None,
-            config,
-            batch_of(kind),
+            batch_of(discount),
             jnp.ones((2, 1)),
             jnp.full(2, -4.0),
             0.1,
@@ -121,16 +247,18 @@ def test_targets_look_one_step_on_unless_the_task_has_ended() -> None:
         np.testing.assert_allclose(probs @ critics.atoms, wanted, rtol=1e-5)
 
 
-def test_what_is_cut_is_not_learnt_from() -> None:
+def test_what_is_not_known_is_not_learnt_from() -> None:
     critics = critics_of(learner_of().config)
     params = critics.init(jax.random.key(0), 2, 1)
     wanted = jnp.full((2, 2, len(critics.atoms)), 1.0 / len(critics.atoms))
-    mixed = batch_of(GOES_ON)._replace(kind=jnp.array([GOES_ON, CUT], jnp.int8))
+    mixed = batch_of(0.5)._replace(is_known=jnp.array([True, False]))
     mixed = mixed._replace(obs=jnp.array([[1.0, 1.0], [5.0, -5.0]]))
     alone = jax.tree.map(lambda leaf: leaf[:1], mixed)
     loss, _ = critic_loss(params, critics, mixed, wanted)
-    np.testing.assert_allclose(loss, critic_loss(params, critics, alone, wanted[:, :1])[0])
-    assert float(critic_loss(params, critics, batch_of(CUT), wanted)[0]) == 0.0
+    np.testing.assert_allclose(
+        loss, critic_loss(params, critics, alone, wanted[:, :1])[0], rtol=1e-6
+    )
+    assert float(critic_loss(params, critics, batch_of(0.5, is_known=False), wanted)[0]) == 0.0
 
 
 def test_the_temperature_falls_where_there_is_too_much_noise() -> None:
@@ -156,18 +284,51 @@ def run_of(learner: Any, iterations: int) -> Any:
 def test_each_part_learns_when_it_is_its_turn() -> None:
     learner = learner_of(
         *("algo.policy_every=2", "algo.updates_per_step=1", "algo.learning_starts=4"),
-        "algo.target_rate=1.0",
+        *("algo.target_rate=1.0", "algo.unroll_length=2"),
     )
-    for number, (before, after, _) in enumerate(run_of(learner, 8), start=1):
-        learns = number >= 4
-        assert int(after.updates) == max(0, number - 3)
-        for name, has_turn in (("critics", learns), ("params", learns and number % 2 == 0)):
+    for number, (before, after, metrics) in enumerate(run_of(learner, 4), start=1):
+        # Of four rows, a critic learns in the last; the policy after every second.
+        assert int(after.updates) == max(0, 2 * number - 3)
+        for name in ("critics", "params"):
             old, new = (jax.tree.leaves(getattr(state, name)) for state in (before, after))
-            assert any((a != b).any() for a, b in zip(old, new, strict=True)) == has_turn
+            assert any((a != b).any() for a, b in zip(old, new, strict=True)) == (number > 1)
+        assert (float(metrics.losses.critic_loss) > 0) == (number > 1)
         # With this rate targets are what the critics have become.
-        if learns:
+        if number > 1:
             chex.assert_trees_all_close(after.targets, after.critics, rtol=1e-6, atol=1e-7)
-        assert float(after.obs_moments.count) == 16 * number  # Each observation counts once.
+        assert float(after.obs_moments.count) == 32 * number  # Each observation counts once.
+
+
+@pytest.mark.parametrize(("updates", "every", "policy"), [(2, 4, 2), (4, 2, 8)])
+def test_the_policy_learns_once_after_so_many_updates(
+    monkeypatch: pytest.MonkeyPatch, updates: int, every: int, policy: int
+) -> None:
+    """Counted while it runs: none is made and not used."""
+    learner = learner_of(
+        *(f"algo.updates_per_step={updates}", f"algo.policy_every={every}"),
+        *("algo.unroll_length=4", "algo.learning_starts=4"),
+    )
+    made: list[str] = []
+
+    def counted(name: str) -> Any:
+        def note(state: Any) -> Any:
+            jax.debug.callback(lambda: made.append(name), ordered=False)
+            return state
+
+        inner = getattr(sac, name)
+
+        def update(*args: Any) -> Any:
+            state, figures = inner(*args)
+            return note(state), figures
+
+        return update
+
+    for name in ("update_critics", "update_policy"):
+        monkeypatch.setattr(sac, name, counted(name))
+    *_, (_, state, _) = run_of(learner, 1)
+    jax.block_until_ready(state)
+    jax.effects_barrier()
+    assert (made.count("update_critics"), made.count("update_policy")) == (4 * updates, policy)
 
 
 def test_it_learns_and_says_where_the_range_of_returns_is_too_small() -> None:
@@ -182,12 +343,25 @@ def test_it_learns_and_says_where_the_range_of_returns_is_too_small() -> None:
     ("override", "message"),
     [
         ("algo.replay_steps=63 algo.unroll_length=2", "algo.replay_steps=63: .* a multiple of"),
+        (
+            "algo.policy_every=3",
+            "algo.policy_every=3: .* a divisor of algo.upd.*=2, or",
+        ),
+        ("algo.policy_every=4", "algo.policy_every=4: .* divides .*unroll_length x .* = 2"),
+        ("algo.n_step=0", "algo.n_step=0: must be at least 1"),
+        ("algo.n_step=64", "algo.n_step=64: .* less than algo.replay_steps=64"),
+        (
+            "algo.replay_precision=float16 algo.normalize_observations=false",
+            "algo.replay_precision=float16: .* float32 where algo.normalize_observations=false",
+        ),
         ("algo.learning_starts=65", "algo.learning_starts=65: .* at most algo.replay_steps=64"),
         ("algo.batch_size=200", "algo.batch_size=200: .* at most num_envs x .* = 160"),
         ("algo.target_std=0.6", "algo.target_std=0.6: .* at most 0.479"),
         ("algo.distribution_type=normal", "algo.distribution_type=normal: .* tanh_normal"),
         ("algo.preserve_outputs=true", "algo.preserve_outputs=True: .* false"),
-        ("algo.updates_per_step=0", "algo.updates_per_step=0"),
+        ("algo.updates_per_step=0", "algo.updates_per_step=0: must be at least 1"),
+        ("algo.recompute_advantages=true", "algo.recompute_advantages"),
+        ("algo.clipping_epsilon=0.2", "algo.clipping_epsilon"),
         ("plan.template=tdg_ex", "plan.template=tdg_ex: not for gmijax.train with algo=sac"),
     ],
 )
