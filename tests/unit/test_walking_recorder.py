@@ -193,7 +193,7 @@ def test_playing_tests_the_policy_of_the_checkpoint(monkeypatch):
         config: Any = SimpleNamespace(seed=0, **changes)
         return playback._walk(config, None, ROBOTS["go1"], "jax", link, learner, state)
 
-    found = walk(walking_envs=2)
+    found = walk(walking_envs=2) or {}
     assert json.loads(json.dumps(found)) == found
     assert (found["num_envs"], found["length_s"], found["walks"]) == (2, 20.0, False)
     assert found["falls"] == {"not_finite": 0, "low": 0, "tilted": 0, "done": 2}
