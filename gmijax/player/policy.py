@@ -18,7 +18,6 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.arrays import array_module
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import POLICY, open_regular, write_bytes
 
@@ -74,7 +73,7 @@ class PlainPolicy:
         Of longer ones the first O numbers are seen: the others are for a value function. Arrays
         of JAX give arrays of JAX.
         """
-        xp = array_module(obs) if hasattr(obs, "shape") else np
+        xp: Any = getattr(obs, "__array_namespace__", lambda: np)()
         seen = xp.asarray(obs, np.float32)[..., : self.obs_size]
         x = (seen - self.obs_mean) / self.obs_std
         if self.obs_clip is not None:

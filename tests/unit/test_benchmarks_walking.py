@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import importlib
 import json
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from supervision import save_meta
 
+import gmijax
+from benchmarks import walking, walking_tests
 from benchmarks.evaluation import walking_tables
 from benchmarks.evaluation.figures import NOT_MEASURED
-from benchmarks.records import ResultsFile
+from benchmarks.records import ResultsFile, read_calls
 from benchmarks.walking import _theirs, summary, walks_from
-from benchmarks.walking_tests import policy_of, walks_twice
+from benchmarks.walking_tests import Policy, policy_of, walks_twice
+from gmijax.config import EnvConfig
+from gmijax.config.schema import to_dict
 from gmijax.player.policy import PlainPolicy, write_policy
-from gmijax.runs.folder import POLICY
+from gmijax.runs.folder import POLICY, RunPaths, read_json, write_json
+from gmijax.runs.resume import CheckpointMeta
 
 
 def checkpoints(*walks: bool | None) -> list[dict[str, Any]]:
@@ -154,3 +162,79 @@ def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypat
         "| `go1` | gmijax | from the cache | 5 of 5 | 50 (40 to 60) | 60 (50 to 120) |  |",
         "| `go1` | gmijax | compiled anew | 5 of 5 | 50 (40 to 60) | 100 (50 to 120) |  |",
     ]
+
+
+def test_one_program_tests_all_checkpoints_of_a_kind(tmp_path, monkeypatch):
+    made = []
+
+    class Test:
+        """Policies walk whose weights are over 1."""
+
+        def __init__(self, env, robot, act, **options):
+            made.append((robot.name, options))
+
+        def compile(self, weights):
+            pass
+
+        def run(self, weights):
+            return SimpleNamespace(as_json=lambda: {"walks": weights > 1})
+
+    monkeypatch.setattr(walking_tests, "WalkingTest", Test)
+    monkeypatch.setattr(walking_tests, "walking_env", lambda *_: None)
+    monkeypatch.setattr(
+        walking_tests, "policy_of", lambda path, _: (path.suffix, Policy(None, int(path.stem)))
+    )
+    env = to_dict(EnvConfig(suite="playground", name="g1_rough", episode_length=None))
+    runs = [["1.a", "2.a", "3.a", "4.a"], ["5.b", "1.a"]]
+    asked = {"env": env, "impl": "jax", "num_envs": 4, "seed": 7, "runs": runs}
+    write_json(tmp_path / "in.json", asked)
+    monkeypatch.setattr("sys.argv", ["x", str(tmp_path / "in.json"), str(tmp_path / "out.json")])
+    assert walking_tests.main() == 0
+    found = [[one["walks"] for one in run] for run in read_json(tmp_path / "out.json")["walks"]]
+    assert found == [[False, True, True], [True, False]]
+    assert made == [("g1", {"num_envs": 4, "seed": 7})] * 2
+
+
+def test_a_call_trains_tests_and_writes_what_it_found(tmp_path, monkeypatch):
+    commands = []
+
+    def run(command, deadline_s, variables):
+        commands.append((command, variables))
+        if "gmijax.train" in command:
+            folder = RunPaths(Path(command[-2].removeprefix("run.dir=")))
+            for steps in (100, 200):
+                meta = CheckpointMeta("go1", "ppo", steps, 1, 4, ((8,), (8,)), "jax", time_s=1e9)
+                save_meta(folder, meta)
+                (folder.checkpoint(steps) / "gmi_0").mkdir()
+            lines = [{"env_steps": steps, "wall_s": steps / 10} for steps in (100, 200)]
+            folder.metrics.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+        elif "benchmarks.walking_tests" in command:
+            asked = read_json(Path(command[-2]))
+            walks = [[{"walks": "100" not in folder} for folder in run] for run in asked["runs"]]
+            write_json(Path(command[-1]), {"walks": walks})
+        return 0
+
+    monkeypatch.setattr(walking, "run_command", run)
+    monkeypatch.setattr(
+        "sys.argv",
+        [
+            *("walking", "env=go1", "num_envs=64", "num_timesteps=20480", "--seeds", "2"),
+            *("--script=--impl=jax", f"--out={tmp_path}", f"--runs={tmp_path}", "--tests=4"),
+            *("--envs=8",),
+        ],
+    )
+    assert walking.main() == 0
+    ours = [command for command, _ in commands if "gmijax.train" in command]
+    assert [command[-1] for command in ours] == ["num_timesteps=1", "seed=0", "seed=1"]
+    every = [one for one in ours[1] if one.startswith("run.checkpoint_every=")]
+    assert gmijax.compose(*ours[1][3:]).run.checkpoint_every == int(every[0].split("=")[1]) > 1
+    theirs = [command for command, _ in commands if "--impl=jax" in command]
+    assert len(theirs) == 3
+    assert theirs[1][3:5] == ["--env_name=Go1JoystickFlatTerrain", "--num_evals=5"]
+    (path,) = tmp_path.glob("walking-go1-*.json")
+    (call,) = read_calls(path)
+    rows = call.results["rows"]
+    assert (rows["gmijax"]["walk"], rows["gmijax"]["seeds"]) == (2, 2)
+    assert rows["gmijax"]["training_s"] == [20.0, 20.0, 20.0]
+    assert rows["train-jax-ppo"]["walk"] == 0
+    assert not list(tmp_path.rglob("gmi_0"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -180,3 +181,23 @@ def test_every_joystick_task_has_a_robot_and_a_key_that_turns_its_pushes_on():
         key = f"{robot.pushes}.enable"
         given = dataclasses.replace(env, name=theirs, settings={key: 0.0})
         assert with_pushes(given, robot).settings == {key: 1.0}
+
+
+def test_heights_are_where_a_ray_of_mujoco_hits_the_ground():
+    text = """
+    <mujoco>
+      <asset><hfield name="field" nrow="4" ncol="3" size="1.0 2.0 0.5 0.1"/></asset>
+      <worldbody><geom type="hfield" hfield="field"/></worldbody>
+    </mujoco>
+    """
+    model = mujoco.MjModel.from_xml_string(text)
+    model.hfield_data[:] = np.random.default_rng(0).uniform(0, 1, 12)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    ground = Ground(model)
+    # At the samples; between them MuJoCo has triangles.
+    for x in (-0.999, 0.0, 0.999):
+        for y in (-1.999, -2 / 3, 2 / 3, 1.999):
+            start, down, hit = np.array([x, y, 5]), np.array([0.0, 0, -1]), np.zeros(1, np.int32)
+            distance = mujoco.mj_ray(model, data, start, down, None, 1, -1, hit)
+            assert ground.height_m(start[:2]) == pytest.approx(5.0 - distance, abs=5e-3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -11,10 +13,13 @@ import mujoco
 import numpy as np
 import pytest
 
+import gmijax
+from gmijax.learning.learner import init_learner, make_learner
 from gmijax.learning.walking import WalkingTest
 from gmijax.player import walking
 from gmijax.player.joystick import ROBOTS, Readings
 from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.workers import playback
 
 XML = """
 <mujoco>
@@ -171,3 +176,29 @@ def test_starts_are_the_same_for_a_seed_and_others_for_another():
 
     assert (keys(0) == keys(0)).all()
     assert (keys(0) != keys(1)).any()
+
+
+def test_playing_tests_the_policy_of_the_checkpoint(monkeypatch):
+    model = mujoco.MjModel.from_xml_string(XML)
+    env = Env(SPEC, (), reset, step, model, lambda state: state.physics.data.qpos)
+    monkeypatch.setattr("gmijax.learning.walking.walking_env", lambda *_: env)
+    algo = gmijax.compose("env=go1", "algo.policy_hidden_layer_sizes=[4]").algo
+    algo = dataclasses.replace(algo, value_obs_key="auto")
+    learner = make_learner(SPEC, algo)
+    state = init_learner(learner, SPEC.obs_size, jax.random.key(0))
+    beats = []
+    link: Any = SimpleNamespace(beat=lambda *beat: beats.append(beat))
+
+    def walk(**changes):
+        config: Any = SimpleNamespace(seed=0, **changes)
+        return playback._walk(config, None, ROBOTS["go1"], "jax", link, learner, state)
+
+    found = walk(walking_envs=2) or {}
+    assert json.loads(json.dumps(found)) == found
+    assert (found["num_envs"], found["length_s"], found["walks"]) == (2, 20.0, False)
+    assert found["falls"] == {"not_finite": 0, "low": 0, "tilted": 0, "done": 2}
+    assert beats[:2] == [("compiling", 0), ("running", 1)]
+    assert beats[-1] == ("running", 20)
+    assert walk(walking_envs=0) is None
+    monkeypatch.setattr("jax.default_backend", lambda: "cpu")
+    assert walk(walking_envs=None) is None
