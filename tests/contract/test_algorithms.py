@@ -31,7 +31,7 @@ from gmijax.learning.checkpoint import (
     restore_replay,
     save_learner,
 )
-from gmijax.learning.checkpoint_saver import CheckpointSaver, Part
+from gmijax.learning.checkpoint_saver import CheckpointPart, CheckpointSaver
 from gmijax.learning.episode_window import Standing
 from gmijax.learning.learner import Learner, TrainState, acting_weights
 from gmijax.learning.policy_file import save_policy
@@ -155,7 +155,7 @@ def test_it_goes_on_from_a_checkpoint_as_if_it_had_not_stopped(case: Case, tmp_p
     meta = checkpoint_meta(case.config, 96, 1, Standing())
     parts = state, algorithm.envs(memory), algorithm.replay(learner, memory)
     own, envs, replay = map(on_host, parts)
-    saver.begin([Part(run, meta, own, envs, replay=replay)])
+    saver.begin([CheckpointPart(run, meta, own, envs, replay=replay)])
     saver.finish()
     saver.stop()
     checkpoint = run.checkpoint(96)
