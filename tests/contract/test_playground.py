@@ -139,7 +139,7 @@ def test_the_walking_test_reads_what_playground_rewards(walked: Walked) -> None:
     seen = np.concatenate([obs[..., 105:107], obs[..., 98:99]], -1)
     np.testing.assert_allclose(steps.velocity, seen, atol=1e-6)
     np.testing.assert_array_equal(steps.command, obs[..., 45:48])
-    effort = np.abs(obs[..., 132:144]) / readings.torque_limit_n_m
+    effort = np.abs(obs[..., 135:147]) / readings.torque_limit_n_m
     np.testing.assert_allclose(steps.load, effort, atol=1e-4)
     walk = measure(steps, robot, Ground(walked.env.mj_model), walked.env.spec.control_dt_s)
     assert (walk.num_envs, walk.upright, walk.walks) == (NUM_ENVS, 1.0, False)
