@@ -21,7 +21,7 @@ from gmijax.deploy.files import stablehlo_content
 from gmijax.deploy.trained import trained_policy
 from gmijax.errors import ConfigError
 from gmijax.sim.interface import Env
-from gmijax.sim.randomize import make_worlds
+from gmijax.sim.randomize import make_worlds, randomized
 from gmijax.sim.registry import make_env, require_env
 from gmijax.sim.robot_models import models_of
 from gmijax.sim.robots import ROBOT_SETTINGS, has_randomizer
@@ -54,15 +54,11 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-def worlds(first_env: int, num_envs: int) -> Env:
-    config = gmijax.compose("env=go1", "env.randomize=on", "env.settings.push=1").env
-    require_env(config)
-    return make_worlds(config, "jax", seed=SEED, first_env=first_env, num_envs=num_envs)
-
-
 @pytest.fixture(scope="module")
 def walked(models: None) -> Walked:
-    env = worlds(0, NUM_ENVS)
+    config = gmijax.compose("env=go1", "env.randomize=on", "env.settings.push=1").env
+    require_env(config)
+    env = make_worlds(config, "jax", seed=SEED, first_env=0, num_envs=NUM_ENVS)
     batch = training_env(env)
     alike = jax.random.split(jax.random.key(0), 1)[jnp.zeros(NUM_ENVS, int)]
     states = [jax.jit(batch.init)(env.model, alike)]
@@ -118,8 +114,9 @@ def test_each_world_has_the_model_that_playground_draws(walked: Walked) -> None:
 
 
 def test_several_gmis_have_the_worlds_of_one(walked: Walked) -> None:
-    for leaf, values in worlds(2, 2).model.items():
-        np.testing.assert_array_equal(values, walked.env.model[leaf][2:])
+    second = randomized(walked.env, {}, seed=SEED, first_env=2, num_envs=2)
+    for leaf, values in walked.env.model.items():
+        np.testing.assert_array_equal(second.model[leaf], values[2:])
 
 
 def test_a_policy_for_go1_is_exported(walked: Walked, tmp_path: Path) -> None:
