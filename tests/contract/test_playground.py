@@ -167,6 +167,33 @@ def test_tuned_settings_are_those_that_playground_ships(name: str) -> None:
     assert (algo.value_obs_key == "state") == (networks.value_obs_key == "state")
 
 
+@pytest.mark.parametrize(
+    ("name", "max_envs", "contacts", "rows"),
+    [
+        ("go1", None, 4 * 8192, 40),
+        ("go1", 16384, 4 * 16384, 40),
+        ("go1_rough", 1024, 8 * 8192, 60),
+        ("go1_rough", 16384, 8 * 16384, 60),
+        ("g1_rough", 16384, 16 * 16384, 128),
+    ],
+)
+def test_buffers_of_warp_grow_with_the_environments(
+    monkeypatch: pytest.MonkeyPatch, name: str, max_envs: int | None, contacts: int, rows: int
+) -> None:
+    configured: dict[str, Any] = {}
+
+    def load(task: str, config_overrides: dict[str, Any]) -> None:
+        configured.update(config_overrides, task=task)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(playground.registry, "load", load)
+    with pytest.raises(ConfigError, match=f"^env.name={name} fails: ValueError: enough"):
+        make_env(name, max_envs=max_envs)
+    # By overrides: the constructor of Go1's task writes over what a configuration has.
+    assert (configured["naconmax"], configured["njmax"]) == (contacts, rows)
+    assert (configured["task"], configured["impl"]) == (ROBOTS[name], "jax")
+
+
 def test_models_and_randomisers_are_known_for_every_task() -> None:
     registry = playground.registry
     for suite in (playground.locomotion, playground.manipulation):
