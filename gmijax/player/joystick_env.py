@@ -14,13 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.player.joystick import ROBOTS, Readings, Robot
+from gmijax.player.joystick_draws import Commands, pusher_of
 from gmijax.player.joystick_model import joystick_model
 from gmijax.player.walking import Recording
 
 Floats = npt.NDArray[np.float32]
-
-_HALF: Final = 0.5
-"""Of a push by a force: with a half sine of this height it changes the velocity by 1/pi of it."""
 
 
 class _Memory(NamedTuple):
@@ -69,12 +67,14 @@ class JoystickEnv:
         self._pose = np.array(about["default_pose_rad"])
         self._low, self._high = np.array(about["target_range_rad"]).T
         _set_gains(model, about)
+        # A start over would hide bad numbers, which are a fall.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.data = mujoco.MjData(model)
         self.readings = Readings(model, self.robot)
         self._imu = model.site(f"imu{self.robot.suffix and '_in' + self.robot.suffix}").id
         self._substeps = round(self.control_dt_s / about["physics_dt_s"])
-        self._pusher = _pusher(about, model, rng) if pushes else None
-        self._commands = _Commands(about, rng)
+        self._pusher = pusher_of(about, model, rng) if pushes else None
+        self._commands = Commands(about, rng)
         amplitudes = [np.resize(part["noise"], part["length"]) for part in about["obs"]]
         self._noise = noise * np.concatenate(amplitudes)
         self.reset()
@@ -199,100 +199,3 @@ def _set_gains(model: Any, about: Mapping[str, Any]) -> None:
     model.opt.timestep = about["physics_dt_s"]
     model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1] = kp, -kp
     model.dof_damping[dofs] = kd + model.actuator_biasprm[:, 2]
-
-
-class _Commands:
-    """Draws commands as Playground does."""
-
-    def __init__(self, about: Mapping[str, Any], rng: np.random.Generator) -> None:
-        self._about, self._rng = about["commands"], rng
-        self._dt_s = about["control_dt_s"]
-        self._left = 0
-
-    def begin(self) -> npt.NDArray[Any]:
-        self._left = self._steps()
-        if "largest" in self._about:
-            return self._rng.uniform(-1, 1, 3) * self._about["largest"]
-        return self._draw(np.zeros(3))
-
-    def next(self, command: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        self._left -= 1
-        if self._left > 0:
-            return command
-        self._left = self._steps()
-        return self._draw(command)
-
-    def _steps(self) -> int:
-        if "every_s" in self._about:
-            return round(self._about["every_s"] / self._dt_s)
-        return round(self._rng.exponential(self._about["mean_s"]) / self._dt_s)
-
-    def _draw(self, command: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        rng, about = self._rng, self._about
-        if "ranges" in about:
-            low, high = np.array(about["ranges"]).T
-            return np.zeros(3) if rng.random() < about["zero"] else rng.uniform(low, high)
-        drawn = rng.uniform(-1, 1, 3) * about["largest"] * (rng.random(3) < about["nonzero"])
-        return np.where(rng.random(3) < 0.5, drawn, command)
-
-
-class _Kicks:
-    """G1, T1: sudden changes of the velocity, at the same intervals all episode long."""
-
-    def __init__(self, about: Mapping[str, Any], rng: np.random.Generator) -> None:
-        self._about, self._rng = about["pushes"], rng
-        self._dt_s = about["control_dt_s"]
-
-    def begin(self) -> None:
-        self._every = round(self._rng.uniform(*self._about["every_s"]) / self._dt_s)
-        self._step = 0
-
-    def push(self, data: Any) -> bool:
-        """Pushes if it is time to; whether it did."""
-        self._step += 1
-        if self._step % self._every:
-            return False
-        angle = self._rng.uniform(0, 2 * np.pi)
-        size = self._rng.uniform(*self._about["change_m_per_s"])
-        data.qvel[:2] += size * np.array([np.cos(angle), np.sin(angle)])
-        return True
-
-
-class _Forces:
-    """Go1, Spot: forces of a half sine over time, all of one size in an episode."""
-
-    def __init__(self, about: Mapping[str, Any], model: Any, rng: np.random.Generator) -> None:
-        self._about, self._rng = about["pushes"], rng
-        self._dt_s = about["control_dt_s"]
-        self._body = model.body(self._about["body"]).id
-        self._mass_kg = model.body_subtreemass[self._body]
-
-    def begin(self) -> None:
-        about, rng = self._about, self._rng
-        self._wait = round(rng.uniform(*about["wait_s"]) / self._dt_s)
-        self._duration_s = rng.uniform(*about["duration_s"])
-        self._steps = round(self._duration_s / self._dt_s)
-        self._size = rng.uniform(*about["impulse_m_per_s"])
-        self._since = self._pushed = 0
-        self._direction = np.zeros(2)
-
-    def push(self, data: Any) -> bool:
-        """Pushes while it is time to; whether it did."""
-        data.xfrc_applied[:] = 0
-        if self._since < self._wait:
-            self._since += 1
-            if self._since >= self._wait:
-                angle = self._rng.uniform(0, 2 * np.pi)
-                self._direction, self._pushed = np.array([np.cos(angle), np.sin(angle)]), 0
-            return False
-        wave = _HALF * np.sin(np.pi * self._pushed * self._dt_s / self._duration_s)
-        force_n = wave * self._mass_kg * self._size / self._duration_s
-        data.xfrc_applied[self._body, :2] = force_n * self._direction
-        if self._pushed >= self._steps:
-            self._since = 0
-        self._pushed += 1
-        return bool(force_n)
-
-
-def _pusher(about: Mapping[str, Any], model: Any, rng: np.random.Generator) -> _Kicks | _Forces:
-    return _Forces(about, model, rng) if "body" in about["pushes"] else _Kicks(about, rng)

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from gmijax.config import EnvConfig
-from gmijax.config.env import ROBOTS
+from gmijax.config.env import ROBOTS, choice_of
 from gmijax.errors import ConfigError
 from gmijax.machine.xla_on_cpu import missing_on_cpu
 from gmijax.sim import source
@@ -60,7 +60,8 @@ def require_task(name: str, suite: str = "gmijax") -> None:
     package = _PACKAGES.get(suite)
     if package is not None and importlib.util.find_spec(package) is None:
         raise ConfigError(
-            f"env={suite}: needs the package {package} (pip install 'gmijax[{suite}]')"
+            f"env={choice_of(suite, name)}: needs the package {package} "
+            f"(pip install 'gmijax[{suite}]')"
         )
     if suite == "custom":
         source.split(name)

@@ -26,7 +26,7 @@ from gmijax.player.joystick import ROBOTS as WALKERS
 from gmijax.player.joystick import Ground, Readings
 from gmijax.player.walking import Recording, measure
 from gmijax.sim.interface import Env
-from gmijax.sim.randomize import make_worlds
+from gmijax.sim.randomize import make_worlds, randomized
 from gmijax.sim.registry import make_env, require_env
 from gmijax.sim.robot_models import models_of
 from gmijax.sim.robots import ROBOT_SETTINGS, has_randomizer
@@ -59,15 +59,11 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-def worlds(first_env: int, num_envs: int) -> Env:
-    config = gmijax.compose("env=go1", "env.randomize=on", "env.settings.push=1").env
-    require_env(config)
-    return make_worlds(config, "jax", seed=SEED, first_env=first_env, num_envs=num_envs)
-
-
 @pytest.fixture(scope="module")
 def walked(models: None) -> Walked:
-    env = worlds(0, NUM_ENVS)
+    config = gmijax.compose("env=go1", "env.randomize=on", "env.settings.push=1").env
+    require_env(config)
+    env = make_worlds(config, "jax", seed=SEED, first_env=0, num_envs=NUM_ENVS)
     batch = training_env(env)
     alike = jax.random.split(jax.random.key(0), 1)[jnp.zeros(NUM_ENVS, int)]
     states = [jax.jit(batch.init)(env.model, alike)]
@@ -123,8 +119,9 @@ def test_each_world_has_the_model_that_playground_draws(walked: Walked) -> None:
 
 
 def test_several_gmis_have_the_worlds_of_one(walked: Walked) -> None:
-    for leaf, values in worlds(2, 2).model.items():
-        np.testing.assert_array_equal(values, walked.env.model[leaf][2:])
+    second = randomized(walked.env, {}, seed=SEED, first_env=2, num_envs=2)
+    for leaf, values in walked.env.model.items():
+        np.testing.assert_array_equal(second.model[leaf], values[2:])
 
 
 def test_the_walking_test_reads_what_playground_rewards(walked: Walked) -> None:
@@ -139,7 +136,7 @@ def test_the_walking_test_reads_what_playground_rewards(walked: Walked) -> None:
     seen = np.concatenate([obs[..., 105:107], obs[..., 98:99]], -1)
     np.testing.assert_allclose(steps.velocity, seen, atol=1e-6)
     np.testing.assert_array_equal(steps.command, obs[..., 45:48])
-    effort = np.abs(obs[..., 132:144]) / readings.torque_limit_n_m
+    effort = np.abs(obs[..., 135:147]) / readings.torque_limit_n_m
     np.testing.assert_allclose(steps.load, effort, atol=1e-4)
     walk = measure(steps, robot, Ground(walked.env.mj_model), walked.env.spec.control_dt_s)
     assert (walk.num_envs, walk.upright, walk.walks) == (NUM_ENVS, 1.0, False)
@@ -193,6 +190,33 @@ def test_tuned_settings_are_those_that_playground_ships(name: str) -> None:
     assert algo.policy_hidden_layer_sizes == networks.policy_hidden_layer_sizes
     assert algo.value_hidden_layer_sizes == networks.value_hidden_layer_sizes
     assert (algo.value_obs_key == "state") == (networks.value_obs_key == "state")
+
+
+@pytest.mark.parametrize(
+    ("name", "max_envs", "contacts", "rows"),
+    [
+        ("go1", None, 4 * 8192, 40),
+        ("go1", 16384, 4 * 16384, 40),
+        ("go1_rough", 1024, 8 * 8192, 60),
+        ("go1_rough", 16384, 8 * 16384, 60),
+        ("g1_rough", 16384, 16 * 16384, 128),
+    ],
+)
+def test_buffers_of_warp_grow_with_the_environments(
+    monkeypatch: pytest.MonkeyPatch, name: str, max_envs: int | None, contacts: int, rows: int
+) -> None:
+    configured: dict[str, Any] = {}
+
+    def load(task: str, config_overrides: dict[str, Any]) -> None:
+        configured.update(config_overrides, task=task)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(playground.registry, "load", load)
+    with pytest.raises(ConfigError, match=f"^env.name={name} fails: ValueError: enough"):
+        make_env(name, max_envs=max_envs)
+    # By overrides: the constructor of Go1's task writes over what a configuration has.
+    assert (configured["naconmax"], configured["njmax"]) == (contacts, rows)
+    assert (configured["task"], configured["impl"]) == (ROBOTS[name], "jax")
 
 
 def test_models_and_randomisers_are_known_for_every_task() -> None:

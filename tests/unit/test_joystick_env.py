@@ -19,7 +19,8 @@ from gmijax.deploy.policy import Policy
 from gmijax.errors import ConfigError
 from gmijax.player.deployment import deployment_of
 from gmijax.player.joystick import ROBOTS, Ground
-from gmijax.player.joystick_env import JoystickEnv, _Commands
+from gmijax.player.joystick_draws import Commands
+from gmijax.player.joystick_env import JoystickEnv
 from gmijax.player.walking import Recording, measure
 
 pytestmark = pytest.mark.skipif(
@@ -122,9 +123,19 @@ def test_go1_at_rest_stands_and_a_limp_one_falls_though_the_task_goes_on(models)
     assert walk.falls["low"] == 1
 
 
+def test_bad_numbers_are_a_fall_and_no_new_start(models):
+    _, about = configured("go1", models)
+    env = JoystickEnv(about, "flat", np.random.default_rng(0))
+    env.data.qvel[3] = np.nan
+    steps = [env.step(np.zeros(12))[1] for _ in range(2)]
+    together = Recording(*(np.concatenate(parts) for parts in zip(*steps, strict=True)))
+    walk = measure(together, env.robot, Ground(env.model), env.control_dt_s)
+    assert walk.falls["not_finite"] == 1
+
+
 def test_commands_are_drawn_as_in_training(models):
     _, about = configured("go1", models, command_forward_m_per_s=0.7)
-    commands = _Commands(about, np.random.default_rng(0))
+    commands = Commands(about, np.random.default_rng(0))
     command, seen = commands.begin(), []
     for _ in range(50_000):
         new = commands.next(command)
@@ -143,7 +154,7 @@ def test_commands_are_drawn_as_in_training(models):
 
 def test_a_humanoids_commands_last_501_steps_and_one_in_ten_is_zero(models):
     _, about = configured("g1", models)
-    commands = _Commands(about, np.random.default_rng(0))
+    commands = Commands(about, np.random.default_rng(0))
     command, ends = commands.begin(), []
     for step in range(501 * 400):
         new = commands.next(command)

@@ -127,7 +127,7 @@ def test_a_task_without_a_randomiser_is_not_randomised(name: str) -> None:
 def test_where_playground_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert refused("env=go1") == (
-        "env=playground: needs the package mujoco_playground (pip install 'gmijax[playground]')"
+        "env=go1: needs the package mujoco_playground (pip install 'gmijax[playground]')"
     )
 
 
