@@ -176,12 +176,12 @@ class Members:
         envs, replays = on_host(env_state), on_host(replay)  # None stays None.
         parts = []
         for number, member in enumerate(self._members):
-            (own, *mine), weights = (learners, envs, replays), learned
+            saved, weights = (learners, envs, replays), learned
             if not self.is_one:
-                (own, *mine), weights = _row(((learners, envs, replays), learned), number)
+                saved, weights = _row((saved, learned), number)
             self._try(member, partial(require_finite, weights, member.config.env.label, env_steps))
             if member.error is None:
-                parts.append(member.part(env_steps, num_gmis, own, *mine, evaluation))
+                parts.append(member.part(env_steps, num_gmis, *saved, evaluation))
         return parts
 
     def close(self) -> None:

@@ -89,7 +89,8 @@ class PlainPolicy:
         variance = np.var(x, axis=-1, keepdims=True)
         x = (x - np.mean(x, axis=-1, keepdims=True)) / np.sqrt(variance + LAYER_NORM_EPSILON)
         x = scale * x + bias
-        return x * (0.5 * np.tanh(0.5 * x) + 0.5)  # SiLU; an exponential would overflow.
+        # SiLU; an exponential would overflow.
+        return np.asarray(x * (0.5 * np.tanh(0.5 * x) + 0.5), np.float32)
 
 
 def write_policy(path: Path, policy: PlainPolicy, *, half: bool = False) -> None:
