@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from gmijax.config import EnvConfig, SacConfig, TrainConfig
+from gmijax.config import AlgoConfig, EnvConfig, SacConfig, TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
 from gmijax.partition.plan import Plan
@@ -114,7 +114,7 @@ def forgotten(config: TrainConfig, plan: Plan) -> str | None:
     meta, before = CheckpointMeta.read(checkpoint), trained_config(checkpoint)[1]
     was = meta.num_gmis, meta.num_envs, meta.impl
     now = plan.layout.num_gmis, config.envs_per_gmi, config.physics.impl
-    is_saved = any(checkpoint.glob(replay_name("*")))
+    is_saved = _has_replay(checkpoint)
     if algo.save_replay and is_saved and was == now:
         return None
     most = meta.num_gmis * meta.num_envs * getattr(before, "replay_steps", algo.replay_steps)
@@ -140,7 +140,8 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
     ):
         if have != want:
             raise ConfigError(f"run.resume={wanted}: checkpoint of {name} {have}, not {want}")
-    trained, _ = trained_config(checkpoint)
+    trained, algo = trained_config(checkpoint)
+    _require_replay_fits(config, algo, checkpoint)
     for key, have in _memory_of(trained).items():
         if have != _memory_of(config.env)[key]:
             want = getattr(config.env, key)
@@ -149,6 +150,25 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
     if config.seed != seed:
         raise ConfigError(f"seed={config.seed}: a resumed run keeps its seed {seed}")
     return meta
+
+
+def _require_replay_fits(config: TrainConfig, saved: AlgoConfig, checkpoint: Path) -> None:
+    algo = config.algo
+    if not isinstance(algo, SacConfig) or not isinstance(saved, SacConfig):
+        return
+    if not algo.save_replay or not _has_replay(checkpoint):
+        return
+    for key in ("replay_steps", "replay_precision"):
+        have, want = getattr(saved, key), getattr(algo, key)
+        if have != want:
+            raise ConfigError(
+                f"algo.{key}={want}: the replay in the checkpoint has {have}; another is allowed "
+                "with algo.save_replay=false, which begins a new one"
+            )
+
+
+def _has_replay(checkpoint: Path) -> bool:
+    return any(checkpoint.glob(replay_name("*")))
 
 
 def _memory_of(env: EnvConfig) -> dict[str, object]:

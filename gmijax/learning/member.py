@@ -176,15 +176,12 @@ class Members:
         envs, replays = on_host(env_state), on_host(replay)  # None stays None.
         parts = []
         for number, member in enumerate(self._members):
-            own, weights = (learners, envs, replays), learned
+            saved, weights = (learners, envs, replays), learned
             if not self.is_one:
-                own, weights = _row((own, learned), number)
+                saved, weights = _row((saved, learned), number)
             self._try(member, partial(require_finite, weights, member.config.env.label, env_steps))
             if member.error is None:
-                learner, its_envs, its_replay = own
-                parts.append(
-                    member.part(env_steps, num_gmis, learner, its_envs, its_replay, evaluation)
-                )
+                parts.append(member.part(env_steps, num_gmis, *saved, evaluation))
         return parts
 
     def close(self) -> None:

@@ -92,7 +92,8 @@ class PlainPolicy:
         variance = xp.var(x, axis=-1, keepdims=True)
         x = (x - xp.mean(x, axis=-1, keepdims=True)) / xp.sqrt(variance + LAYER_NORM_EPSILON)
         x = scale * x + bias
-        return x * (0.5 * xp.tanh(0.5 * x) + 0.5)  # SiLU; an exponential would overflow.
+        # SiLU; an exponential would overflow.
+        return xp.asarray(x * (0.5 * xp.tanh(0.5 * x) + 0.5), xp.float32)
 
 
 def write_policy(path: Path, policy: PlainPolicy, *, half: bool = False) -> None:

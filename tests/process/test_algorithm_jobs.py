@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -77,13 +76,18 @@ def test_a_replay_that_is_saved_goes_on_with_its_run(tmp_path: Path) -> None:
     again, whole = (learner_arrays(tmp_path / run) for run in ("again", "run"))
     for array, other in zip(again, whole, strict=True):
         np.testing.assert_array_equal(array, other)
-    # With another size it does not fit; a larger one than there is memory is not begun.
-    for key, said in (
-        ("algo.replay_steps=32", "replay_0 does not fit this job"),
-        ("algo.replay_steps=16000000000", "16000000000 steps of each (algo.replay_steps)"),
+    # What does not fit it is refused; so is one that is larger than the memory.
+    resumed, most = (f"run.resume={half}", "run.dir=bad"), 16_000_000_000
+    for line, said in (
+        ((*resumed, "algo.replay_steps=32"), "algo.replay_steps=32: the replay in the checkpoint"),
+        ((*resumed, "algo.replay_precision=float32"), "algo.replay_precision=float32: the replay"),
+        (
+            (*BASE, *SAC, "run.dir=big", f"algo.replay_steps={most}"),
+            f"{most} steps of each (algo.",
+        ),
     ):
-        done = train(f"run.resume={half}", "run.dir=bad", key, cwd=tmp_path)
+        done = train(*line, cwd=tmp_path)
         assert done.returncode == 2
         assert said in done.stderr
         assert len(done.stderr.splitlines()) == 1
-        shutil.rmtree(tmp_path / "bad")
+    assert not (tmp_path / "bad").exists()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import chex
@@ -13,10 +15,16 @@ import pytest
 from toy_env import point_mass
 
 import gmijax
+from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.collectives.program import LocalCollectives
 from gmijax.errors import ConfigError
+from gmijax.learning.checkpoint import checkpoint_meta, on_host
+from gmijax.learning.checkpoint_saver import CheckpointSaver, Part
+from gmijax.learning.episode_window import Standing
+from gmijax.learning.member import Member, Members
 from gmijax.learning.normalize import moments_of, no_samples
 from gmijax.learning.start import begin_episodes
+from gmijax.runs.folder import RunPaths
 from gmijax.sac import sac
 from gmijax.sac.critics import critics_of, projected
 from gmijax.sac.losses import Batch, critic_loss, target_probs, temperature_loss
@@ -329,6 +337,32 @@ def test_the_policy_learns_once_after_so_many_updates(
     jax.block_until_ready(state)
     jax.effects_barrier()
     assert (made.count("update_critics"), made.count("update_policy")) == (4 * updates, policy)
+
+
+def test_several_runs_get_back_the_replays_that_are_theirs(tmp_path: Path) -> None:
+    members, replays = [], []
+    for number in range(2):
+        run = RunPaths(tmp_path / str(number))
+        run.root.mkdir()
+        config = gmijax.compose(*TINY, "algo.save_replay=true", "physics.impl=jax")
+        replay = ring_of(6 + 3 * number, [3, 5], 12)
+        saver = CheckpointSaver(0, SingleRankCommunicator(), None)
+        envs = {"x": np.zeros(1)}
+        meta = checkpoint_meta(config, 32, 1, Standing())
+        saver.begin([Part(run, meta, None, envs, replay=on_host(replay))])
+        saver.finish()
+        saver.stop()
+        going_on = replace(config.run, resume=str(run.checkpoint(32)))
+        members.append(Member(replace(config, run=going_on), run))
+        replays.append(replay)
+    template = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((2, *leaf.shape), leaf.dtype), replay
+    )
+    found = Members(members, 0).restored_replay(template, 0, 1)
+    expected = jax.tree.map(lambda *rows: np.stack(rows), *map(on_host, replays))
+    chex.assert_trees_all_equal(found, expected)
+    # Other environments, other experience.
+    assert Members(members, 0).restored_replay(template, 0, 2) is None
 
 
 def test_it_learns_and_says_where_the_range_of_returns_is_too_small() -> None:
