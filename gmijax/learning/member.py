@@ -181,7 +181,10 @@ class Members:
                 saved, weights = _row((saved, learned), number)
             self._try(member, partial(require_finite, weights, member.config.env.label, env_steps))
             if member.error is None:
-                parts.append(member.part(env_steps, num_gmis, *saved, evaluation))
+                learner, own_envs, own_replay = saved
+                parts.append(
+                    member.part(env_steps, num_gmis, learner, own_envs, own_replay, evaluation)
+                )
         return parts
 
     def close(self) -> None:

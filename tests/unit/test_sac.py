@@ -19,7 +19,7 @@ from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.collectives.program import LocalCollectives
 from gmijax.errors import ConfigError
 from gmijax.learning.checkpoint import checkpoint_meta, on_host
-from gmijax.learning.checkpoint_saver import CheckpointSaver, Part
+from gmijax.learning.checkpoint_saver import CheckpointPart, CheckpointSaver
 from gmijax.learning.episode_window import Standing
 from gmijax.learning.member import Member, Members
 from gmijax.learning.normalize import moments_of, no_samples
@@ -349,7 +349,7 @@ def test_several_runs_get_back_the_replays_that_are_theirs(tmp_path: Path) -> No
         saver = CheckpointSaver(0, SingleRankCommunicator(), None)
         envs = {"x": np.zeros(1)}
         meta = checkpoint_meta(config, 32, 1, Standing())
-        saver.begin([Part(run, meta, None, envs, replay=on_host(replay))])
+        saver.begin([CheckpointPart(run, meta, None, envs, replay=on_host(replay))])
         saver.finish()
         saver.stop()
         going_on = replace(config.run, resume=str(run.checkpoint(32)))
