@@ -86,7 +86,7 @@ def _round(
 ) -> tuple[tuple[SacState, Memory], tuple[RolloutSums, Learnt]]:
     """A step of all environments, and the updates after it."""
     state, memory = before
-    memory, stats = _act(env, learner, model, state, memory)
+    memory, stats = step_into_replay(env, learner, model, state, memory)
     after, figures, policy_loss = _learn(learner, collectives, memory.replay, state, key)
     # The same on all GMIs, whose replays fill alike. Before, there is too little to learn from.
     is_ready = can_learn(memory.replay, learner.config.learning_starts)
@@ -118,7 +118,7 @@ def _where(condition: Array, new: SacState, old: SacState) -> SacState:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def _act(
+def step_into_replay(
     env: BatchedEnv, learner: SacLearner, model: PyTree, state: SacState, memory: Memory
 ) -> tuple[Memory, RolloutSums]:
     """A step of this GMI's environments, into its replay."""
