@@ -246,6 +246,7 @@ def test_a_call_trains_tests_and_writes_what_it_found(works, tmp_path, monkeypat
     (path,) = tmp_path.glob("walking-go1-*.json")
     (call,) = read_calls(path)
     rows = call.results["rows"]
+    assert "folder" not in call.results["runs"][0]["checkpoints"][0]
     # Only of tests that all ran the last checkpoint alone is enough.
     assert (rows["gmijax"]["walk"], rows["gmijax"]["seeds"]) == (2 if works else 0, 2)
     assert rows["gmijax"]["training_s"] == ([20.0, 20.0, 20.0] if works else None)
