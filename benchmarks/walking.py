@@ -41,6 +41,8 @@ from gmijax.runs.resume import CheckpointMeta, checkpoints_of
 from gmijax.sim.robots import playground_name
 
 OURS, SCRIPT = "gmijax", "train-jax-ppo"
+BRAX_CONFIG = "ppo_network_config.json"
+"""What Brax's PPO writes into every checkpoint beside the weights."""
 
 
 class Benchmark:
@@ -49,9 +51,17 @@ class Benchmark:
     def __init__(self, given: argparse.Namespace, config: TrainConfig, scratch: Path) -> None:
         self._given, self._config, self._scratch = given, config, scratch
         self._deadline_s = deadline(given.deadline_s)
+        self._trained_by_s = self._deadline_s - given.reserve_s
         path = given.out / file_name(f"walking-{config.env.slug}", device_name())
         self.file = ResultsFile(path, "walking", vars(given))
         self.runs: list[dict[str, Any]] = []
+        self._code_of_tests = 0
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether a training of ours or the tests failed; the script may fail at its film."""
+        ours = [run["code"] for run in self.runs if run["trainer"] == OURS]
+        return any(ours) or self._code_of_tests != 0
 
     def run(self) -> None:
         """Trains with all seeds, tests, and writes both down."""
@@ -59,7 +69,7 @@ class Benchmark:
         if not self._given.cold:
             for trainer in trainers:
                 self._train(trainer, "compile", is_short=True)
-        for seed, trainer in in_turn(trainers, self._given.seeds, self._deadline_s):
+        for seed, trainer in in_turn(trainers, self._given.seeds, self._trained_by_s):
             self.runs.append({"trainer": trainer, "seed": seed, **self._train(trainer, str(seed))})
             self._write()
         self._test()
@@ -77,7 +87,7 @@ class Benchmark:
             command = self._script_command(folder, name, is_short=is_short)
             variables |= variables_of_brax("playground")
         started_s = time.time()
-        code = run_command(command, self._deadline_s, variables)
+        code = run_command(command, self._trained_by_s, variables)
         command_s = time.time() - started_s
         checkpoints = _ours(folder, started_s) if trainer == OURS else _theirs(folder, started_s)
         for one in checkpoints:  # Environments take hundreds of MB; only policies are tested.
@@ -122,7 +132,7 @@ class Benchmark:
         module = [sys.executable, "-m", "benchmarks.walking_tests"]
         command = [*module, str(self._scratch / "tests.json"), str(out)]
         cache = {"JAX_COMPILATION_CACHE_DIR": str(self._scratch / "xla")}
-        code = run_command(command, self._deadline_s, cache)
+        self._code_of_tests = code = run_command(command, self._deadline_s, cache)
         found = read_json(out)["walks"] if out.exists() else [[] for _ in self.runs]
         for run, walks in zip(self.runs, found, strict=True):
             for checkpoint, walk in zip(run["checkpoints"], walks, strict=False):
@@ -131,8 +141,12 @@ class Benchmark:
 
     def _write(self) -> None:
         rows = summary(self.runs)
+        runs = [
+            {**run, "checkpoints": [_without_folder(one) for one in run["checkpoints"]]}
+            for run in self.runs
+        ]
         with self.file.changing() as results:
-            results.update(task=self._config.env.label, rows=rows, runs=self.runs)
+            results.update(task=self._config.env.label, rows=rows, runs=runs)
 
 
 def walks_from(
@@ -144,8 +158,12 @@ def walks_from(
         after = tested[number + 1 : number + 2]
         is_last = is_complete and number == len(checkpoints) - 1
         if one["walk"]["walks"] and (is_last or (after and after[0]["walk"]["walks"])):
-            return {key: value for key, value in one.items() if key not in ("folder", "walk")}
+            return {key: value for key, value in _without_folder(one).items() if key != "walk"}
     return None
+
+
+def _without_folder(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in checkpoint.items() if key != "folder"}
 
 
 def summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -185,7 +203,7 @@ def _ours(folder: Path, started_s: float) -> list[dict[str, Any]]:
 
 def _theirs(folder: Path, started_s: float) -> list[dict[str, Any]]:
     """As `_ours`, of Playground's script, which does not say when it made its first step."""
-    found = sorted(folder.glob("*/checkpoints/*/ppo_network_config.json"))
+    found = sorted(folder.glob(f"*/checkpoints/*/{BRAX_CONFIG}"))
     return [
         {
             "folder": str(path.parent),
@@ -198,7 +216,7 @@ def _theirs(folder: Path, started_s: float) -> list[dict[str, Any]]:
 
 
 def main() -> int:
-    """Measures what the command line asks for; returns 1 if a training of ours failed, else 0."""
+    """Measures what the command line asks for; returns 1 if some of it failed, else 0."""
     given = _options()
     config = gmijax.compose(*given.overrides)
     if robot_of(config.env) is None:
@@ -210,7 +228,7 @@ def main() -> int:
         benchmark.run()
     for trainer, row in summary(benchmark.runs).items():
         sys.stdout.write(f"{trainer}: {row}\n")
-    return int(any(run["code"] for run in benchmark.runs if run["trainer"] == OURS))
+    return int(benchmark.has_failed)
 
 
 def _options() -> argparse.Namespace:
@@ -223,6 +241,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--cold", action="store_true", help="compile in every training")
     parser.add_argument("--script", help="train with Playground's script too, with these flags")
     parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
+    parser.add_argument("--reserve-s", type=float, default=150.0, help="of these, for the tests")
     parser.add_argument("--runs", type=Path, help="keep the trainings here, without environments")
     return parser.parse_intermixed_args()
 

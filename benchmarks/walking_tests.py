@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from benchmarks.walking import BRAX_CONFIG
 from gmijax.config import EnvConfig
 from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
@@ -84,8 +85,7 @@ def _of_brax(checkpoint: Path, env: Env) -> Policy:
     """A policy of Brax's PPO, with the observations that its networks want."""
     saved = importlib.import_module("brax.training.agents.ppo.checkpoint")
     networks = importlib.import_module("brax.training.agents.ppo.networks")
-    network = saved._get_ppo_network(saved.load_config(checkpoint), networks.make_ppo_networks)
-    make_policy = networks.make_inference_fn(network)
+    make_policy = networks.make_inference_fn(_network(read_json(checkpoint / BRAX_CONFIG)))
     seen = env.spec.actor_obs_size
 
     def act(weights: Any, obs: Any) -> Any:
@@ -93,6 +93,30 @@ def _of_brax(checkpoint: Path, env: Env) -> Policy:
         return make_policy(weights, deterministic=True)(named, jax.random.key(0))[0]
 
     return Policy(act, jax.tree.map(jnp.asarray, saved.load(checkpoint)))
+
+
+def _network(config: Mapping[str, Any]) -> Any:
+    """The networks of a checkpoint; Brax 0.14.2 cannot make them of its own file.
+
+    That has shapes for sizes, and no initialisers where they are the default.
+    """
+    networks = importlib.import_module("brax.training.agents.ppo.networks")
+    options = {
+        name: value
+        for name, value in config["network_factory_kwargs"].items()
+        if value is not None and not name.endswith("kernel_init_fn")
+    }
+    if "activation" in options:
+        known = importlib.import_module("brax.training.networks").ACTIVATION
+        options["activation"] = known[options["activation"]]
+    if config["normalize_observations"]:
+        statistics = importlib.import_module("brax.training.acme.running_statistics")
+        options["preprocess_observations_fn"] = statistics.normalize
+    sizes = {
+        name: tuple(size["shape"] if isinstance(size, Mapping) else size)
+        for name, size in config["observation_size"].items()
+    }
+    return networks.make_ppo_networks(sizes, config["action_size"], **options)
 
 
 if __name__ == "__main__":
