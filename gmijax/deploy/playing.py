@@ -55,7 +55,7 @@ from gmijax.runs.resume import (
 )
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
-from gmijax.sim.registry import draws_models, require_env
+from gmijax.sim.registry import TASKS, draws_models, require_env
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.run_gmis import Launch, run_gmis
 from gmijax.viewer.installed import INSTALL, missing
@@ -115,7 +115,7 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     console.print(f"returns: {nearby(paths.returns)}")
     if not paths.model.exists():
         without_film(config, returns["env"], console)
-        print_next(console, *_next_steps(config))
+        print_next(console, *_next_steps(config, returns["env"]))
         return
     try:
         if config.html != "off":
@@ -125,7 +125,7 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     finally:
         # With its textures a robot takes 100 MB, for every checkpoint that is played.
         paths.model.unlink(missing_ok=True)
-    print_next(console, *_next_steps(config))
+    print_next(console, *_next_steps(config, returns["env"]))
 
 
 def _walking(config: PlayConfig, walk: Mapping[str, Any] | None) -> str:
@@ -145,7 +145,7 @@ def _return_while_training(config: PlayConfig, returns: Mapping[str, Any]) -> st
     return f"while training: {at_it[-1]:.2f} {EXPLORING}"
 
 
-def _next_steps(config: PlayConfig) -> tuple[tuple[str, str], ...]:
+def _next_steps(config: PlayConfig, label: str) -> tuple[tuple[str, str], ...]:
     if config.checkpoint == SHIPPED:
         task = config.run.env
         return (
@@ -153,10 +153,9 @@ def _next_steps(config: PlayConfig) -> tuple[tuple[str, str], ...]:
             ("train it yourself", f"gmijax train env={task}"),
         )
     folder = shlex.quote(nearby(Path(str(config.run.dir))))
-    return (
-        ("watch it in the browser", f"gmijax view run.dir={folder}"),
-        ("write the policy as files for a robot", f"gmijax export run.dir={folder}"),
-    )
+    view = ("watch it in the browser", f"gmijax view run.dir={folder}")
+    export = ("write the policy as files for a robot", f"gmijax export run.dir={folder}")
+    return (view, export) if label in TASKS else (export,)  # The viewer has our tasks alone.
 
 
 def _require_page(config: PlayConfig) -> None:
