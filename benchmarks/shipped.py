@@ -34,6 +34,7 @@ from benchmarks.records import ResultsFile, device_name, file_name
 from benchmarks.runner import STOP_S, exit_code, options
 from gmijax.cli.compose import compose
 from gmijax.errors import JobInterrupted, SweepFailed
+from gmijax.machine.snapshot import detect_machine
 from gmijax.player.policy import read_policy, write_policy
 from gmijax.player.returns import Played, play
 from gmijax.player.shipped import POLICIES
@@ -43,8 +44,8 @@ from gmijax.runs.resume import CheckpointMeta, best_checkpoint
 from gmijax.sweeps.sweep import sweep
 
 SEED = 0
-PLACES = 8
-"""Of the sweep on the GPU, more than there are tasks: MJX-Warp takes memory beside its place."""
+SLOTS = 8
+"""Of the sweep on the GPU, more than there are tasks: MJX-Warp takes memory beside its slot."""
 
 AT_ONCE = 8
 """Episodes in plain MuJoCo that a process plays one after the other."""
@@ -98,8 +99,10 @@ def train(given: argparse.Namespace, root: Path, file: ResultsFile) -> int:
     alarm.daemon = True
     alarm.start()
     try:
+        # Without a GPU, slots would divide the cores.
+        slots = SLOTS if detect_machine().gpus else 1
         with suppress(JobInterrupted, SweepFailed):
-            sweep(configs, jobs_per_gpu=PLACES, gpus=1)
+            sweep(configs, jobs_per_gpu=slots, gpus=1)
     finally:
         alarm.cancel()
     if not (root / "sweep.json").exists():
