@@ -113,8 +113,8 @@ class EnvConfig(KeyGroup):
         default="off",
     )
     randomize: Literal["off", "on", "episode"] = doc(
-        "give every environment its own model, drawn from env.randomization: once (on), or for "
-        "every episode",
+        "give every environment its own model, drawn from env.randomization, or as Playground "
+        "draws it: once (on), or for every episode",
         default="off",
     )
     randomization: Mapping[str, LeafRange] = dataclasses.field(
