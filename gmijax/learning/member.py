@@ -176,15 +176,14 @@ class Members:
         envs, replays = on_host(env_state), on_host(replay)  # None stays None.
         parts = []
         for number, member in enumerate(self._members):
-            saved, weights = (learners, envs, replays), learned
+            own, weights = (learners, envs, replays), learned
             if not self.is_one:
-                saved, weights = _row((saved, learned), number)
+                own, weights = _row((own, learned), number)
+            learner, own_envs, own_replay = own
             self._try(member, partial(require_finite, weights, member.config.env.label, env_steps))
             if member.error is None:
-                learner, own_envs, own_replay = saved
-                parts.append(
-                    member.part(env_steps, num_gmis, learner, own_envs, own_replay, evaluation)
-                )
+                part = member.part(env_steps, num_gmis, learner, own_envs, own_replay, evaluation)
+                parts.append(part)
         return parts
 
     def close(self) -> None:
