@@ -138,14 +138,15 @@ def keep(
         sys.stdout.write(f"{task}: no checkpoint\n")
         return
     steps = CheckpointMeta.read(best).env_steps
+    lines = [line for line in read_metrics(RunPaths(run_dir).metrics) if "eval/return" in line]
     evaluations = [
         {"env_steps": line["env_steps"], "return": line["eval/return"], **_of(line)}
-        for line in read_metrics(RunPaths(run_dir).metrics)
-        if "eval/return" in line
+        for line in lines
     ]
+    trained_s = next((line["wall_s"] for line in lines if line["env_steps"] == steps), None)
     summary = read_json(RunPaths(run_dir).summary)
     policy = read_policy(best / POLICY)
-    about = {**policy.about, "device": device_name(), "train_wall_s": summary.get("train_wall_s")}
+    about = {**policy.about, "device": device_name(), "train_wall_s": trained_s}
     given.policies.mkdir(parents=True, exist_ok=True)
     path = given.policies / f"{task}.npz"
     write_policy(path, dataclasses.replace(policy, about=about), half=True)
@@ -154,6 +155,7 @@ def keep(
             "overrides": overrides(task, given),
             "code": code,
             "env_steps": steps,
+            "trained_s": trained_s,
             **{name: summary.get(name) for name in OF_SUMMARY},
             "bytes": path.stat().st_size,
             "mjx": next((one for one in evaluations if one["env_steps"] == steps), None),

@@ -58,13 +58,9 @@ def demo(overrides: Sequence[str]) -> None:
     task, has_keys = names[-1] if names else TASK, len(names) < len(overrides)
     config = _training(overrides, task) if has_keys else None
     console = open_console(show=True)
-    is_shown = task in shipped_tasks() or (
-        config is None and (bool(names) or bool(shipped_tasks()))
-    )
-    if is_shown:
+    if config is None or task in shipped_tasks():
         show_shipped(task, console)
-    # A checkout may have no policies yet: then there is only training to show.
-    if config is None and (not is_shown or _is_wanted()):
+    if config is None and _is_wanted():
         config = _training((), TASK)
     if config is None:
         console.print(f"train it yourself:\n  gmijax train env={task}")
@@ -121,7 +117,8 @@ def _told(task: str, returns: dict[str, Any]) -> list[str]:
     about, mean = returns["policy"], returns["return"]
     where = ""
     if about.get("train_wall_s") and about.get("device"):
-        where = f" in {about['train_wall_s']:.0f} s on one {about['device']}, beside others"
+        device = "a CPU" if about["device"] == "cpu" else f"one {about['device']}, beside others"
+        where = f" in {about['train_wall_s']:.0f} s on {device}"
     metrics = [f"{name} {values['mean']:.2f}" for name, values in returns["metrics"].items()]
     return [
         f"{task}: a policy that gmijax trained for {returns['env_steps']:,} env steps{where}",
