@@ -48,8 +48,8 @@ class SacConfig(PolicyConfig):
         "steps of every environment before the first update, also after a resume", low=2
     )
     replay_precision: Literal["float32", "float16"] = doc(
-        "of observations and actions in the replay; float16 keeps observations in units of their "
-        "statistics after the first iteration, which is not learnt from",
+        "of observations and actions in the replay; float16 keeps the distance from the mean, "
+        "by the statistics of the time",
         default="float32",
     )
     save_replay: bool = doc(

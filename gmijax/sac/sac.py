@@ -22,7 +22,7 @@ from gmijax.learning.learner import acting_weights, finish_iteration, make_learn
 from gmijax.learning.normalize import moments_of, without_outliers
 from gmijax.learning.unroll import RolloutSums, act, count, merge_sums, outcome_of, unroll
 from gmijax.sac.losses import CriticFigures
-from gmijax.sac.replay import Replay, can_learn, insert, kind_of, size_bytes, with_units
+from gmijax.sac.replay import Replay, can_learn, insert, kind_of, size_bytes
 from gmijax.sac.state import Memory, SacLearner, SacState, begin, init, num_averaged
 from gmijax.sac.updates import Learnt, losses_of, update_critics, update_policy
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
@@ -40,7 +40,6 @@ def iterate(
     """See `gmijax.learning.algorithm.Iterate`: T rounds of a step and its updates."""
     config = learner.config
     key = jax.random.fold_in(jax.random.fold_in(state.key, state.iteration), collectives.rank())
-    memory = memory._replace(replay=with_units(memory.replay, state.obs_moments))
     length = config.rounds_per_turn
     keys = jax.random.split(key, (config.unroll_length // length, length + 1))
     turn = partial(_turn, env, learner, collectives, model)
@@ -53,6 +52,7 @@ def iterate(
         **policy_figures(state),
         "policy/temperature": jnp.exp(state.log_temperature),
         "replay/steps": memory.replay.filled.astype(jnp.float32),
+        "replay/clipped": memory.replay.num_clipped,
         "replay/mib": jnp.asarray(size_bytes(memory.replay) / 2**20, jnp.float32),
     }
     return state, memory, IterationMetrics(counts, losses_of(losses), figures, {})
@@ -139,7 +139,10 @@ def step_into_replay(
     )
     # Each observation counts once, when it is made: batches show the same ones again and again.
     seen = moments_of(without_outliers(weights.moments, obs), 2)
-    replay = insert(memory.replay, obs, action, reward, kind)
+    known = weights.moments
+    # The first iteration has its own statistics alone.
+    units = jax.tree.map(partial(jnp.where, known.count > 0), known, seen)
+    replay = insert(memory.replay, units, obs, action, reward, kind)
     return Memory(envs, replay), RolloutSums(seen, count(reward, outcomes))
 
 

@@ -33,13 +33,11 @@ from gmijax.sac.replay import (
     GOES_ON,
     TERMINATED,
     Replay,
-    can_learn,
     empty_replay,
     insert,
     kind_of,
     sample,
     sample_obs,
-    with_units,
 )
 from gmijax.sac.sac import SAC
 from gmijax.sac.updates import target_entropy
@@ -76,7 +74,9 @@ def ring_of(num_inserted: int, lengths: list[int], ring: int) -> Replay:
     replay = empty_replay(spec, ring, len(lengths), jnp.float32)
     for first in range(0, num_inserted, 3):
         obs, kind = rows(first, 3, lengths)
-        replay = jax.jit(insert)(replay, obs, jnp.zeros((*kind.shape, 1)), obs[..., 1], kind)
+        replay = jax.jit(insert)(
+            replay, no_samples((2,)), obs, jnp.zeros((*kind.shape, 1)), obs[..., 1], kind
+        )
     return replay
 
 
@@ -160,7 +160,8 @@ def test_a_target_of_three_steps_ends_where_nothing_more_is_known(
     replay = empty_replay(EnvSpec("x", 1, 1, 0.0, 0, ()), 5, 1, jnp.float32)
     for row in range(len(kind)):
         obs = number[row : row + 1, :, None]
-        replay = insert(replay, obs, obs, 2.0 ** number[row : row + 1], kind[row : row + 1])
+        rewards = 2.0 ** number[row : row + 1]
+        replay = insert(replay, no_samples((1,)), obs, obs, rewards, kind[row : row + 1])
     drawn = jax.device_get(draw(replay, jax.random.key(0), 512, 3, 0.5))
     mine = np.flatnonzero(drawn.obs[:, 0] == 0.0)
     assert len(mine) > 20
@@ -173,35 +174,39 @@ def test_a_target_of_three_steps_ends_where_nothing_more_is_known(
         assert found.next_obs == [next_obs]
 
 
-def test_half_precision_keeps_small_changes_and_forgets_what_has_no_units() -> None:
-    spec, rng = EnvSpec("x", 3, 1, 0.0, 0, ()), np.random.default_rng(0)
-    # A height, one that has never moved so far, and one that is beyond what float16 can hold.
-    scale, shift = np.array([0.01, 0.0, 1e6]), np.array([9.81, 0.5, 0.0])
+def test_half_precision_keeps_small_changes_of_inputs_that_drift() -> None:
+    spec, rng = EnvSpec("x", 4, 1, 0.0, 0, ()), np.random.default_rng(0)
+    # A height, one that does not move at first, one that drifts far, one beyond float16's range.
+    scale, shift = np.array([0.01, 0.0, 0.01, 1e6]), np.array([9.81, 0.5, 0.0, 0.0])
 
     def made(num: int) -> np.ndarray:
-        return (shift + scale * rng.normal(size=(num, 2, 3))).astype(np.float32)
+        return (shift + scale * rng.normal(size=(num, 2, 4))).astype(np.float32)
 
-    def with_rows(replay: Replay, obs: np.ndarray) -> Replay:
+    replay = empty_replay(spec, 8, 2, jnp.float16)
+    rows = []
+    for _ in range(3):  # 12 rows: the first of them are overwritten.
+        obs = made(4)
         zeros = jnp.zeros(obs.shape[:2])
-        return insert(replay, obs, zeros[..., None] + 0.3, zeros, zeros.astype(jnp.int8))
-
-    replay = with_units(empty_replay(spec, 8, 2, jnp.float16), no_samples((3,)))
-    replay = with_rows(replay, made(4))
-    assert not can_learn(replay, 4)
-    moments = moments_of(made(400), 2)
-    replay = with_units(replay, moments)
-    assert int(replay.filled) == 0
+        args = zeros[..., None] + 0.3, zeros, zeros.astype(jnp.int8)
+        replay = insert(replay, moments_of(obs, 2), obs, *args)
+        rows.append(obs)
+        shift[2] += 1000.0
     obs = made(4)
-    obs[2, 0, 1] = 400.0
-    replay = with_units(with_rows(replay, obs), moments_of(10.0 * obs, 2))  # Has them by now.
-    assert can_learn(replay, 4)
+    obs[2, 0, 1] = 2000.0
+    replay = insert(replay, moments_of(rows[-1], 2), obs, *args)
+    assert float(replay.num_clipped) == 0.0
     found = np.asarray(sample_obs(replay, jax.random.key(0), 256))
-    for row in found:
-        error = np.abs(obs.reshape(-1, 3) - row) / np.array([0.01, 400.0, 1e6])
+    kept = np.concatenate([rows[-1], obs]).reshape(-1, 4)
+    for row in found:  # The last rows came with statistics from before a drift.
+        error = np.abs(kept - row) / np.array([0.01, 2000.0, 1000.0, 1e6])
         assert error.max(axis=1).min() < 2e-3
+        if row[2] < 2500.0:
+            assert np.abs(rows[-1].reshape(-1, 4)[:, 2] - row[2]).min() < 1e-3
     drawn = draw(replay, jax.random.key(0), 64, 1, 0.5)
     assert drawn.obs.dtype == drawn.action.dtype == jnp.float32
     np.testing.assert_allclose(drawn.action, 0.3, rtol=1e-3)
+    obs[0, 0, 1] = -1e6
+    assert float(insert(replay, moments_of(rows[-1], 2), obs, *args).num_clipped) == 1.0
 
 
 def test_what_follows_a_step() -> None:
