@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from gmijax.config.algo import PolicyConfig
+from gmijax.config.algo import KeptReplay, PolicyConfig
 from gmijax.config.schema import doc
 from gmijax.errors import ConfigError
 
@@ -19,6 +19,10 @@ class SacConfig(PolicyConfig):
     """Hyper-parameters of SAC with many environments and large batches (arXiv:2512.01996)."""
 
     implementation = "gmijax.sac.sac:SAC"
+    fixed_keys = (
+        *PolicyConfig.fixed_keys,
+        *("critic_hidden_layer_sizes", "num_atoms", "value_range"),
+    )
 
     # algo= sets it.
     name: Literal["sac"] = "sac"
@@ -53,8 +57,8 @@ class SacConfig(PolicyConfig):
         default="float32",
     )
     save_replay: bool = doc(
-        "checkpoints hold the replay too, and a resumed run learns on with it; false: it fills "
-        "the replay anew first",
+        "the checkpoint at the end of a run, or where it is stopped, holds the replay too, and a "
+        "resumed run learns on with it; false, or after a fault: it fills the replay anew first",
         default=False,
     )
     critic_hidden_layer_sizes: tuple[int, ...] = doc("widths of each of the two critics", low=1)
@@ -72,6 +76,12 @@ class SacConfig(PolicyConfig):
         positive=True,
     )
     init_temperature: float = doc("weight of the entropy at first", positive=True)
+
+    @property
+    def kept_replay(self) -> KeptReplay:
+        """See `PolicyConfig`."""
+        keys = "replay_steps", "replay_precision"
+        return KeptReplay(self.replay_steps, self.learning_starts, self.save_replay, keys)
 
     @property
     def kept_steps(self) -> int:
