@@ -144,7 +144,7 @@ def resolved(config: TrainConfig, algo: SacConfig) -> dict[str, Any]:
     }
 
 
-def measured(given: argparse.Namespace, config: Any, backend: str) -> dict[str, Any]:
+def measured(given: argparse.Namespace, config: Any, backend: Any) -> dict[str, Any]:
     """One repeat: rates of both ways, and how the second compares."""
     overrides, per_iteration = tuple(given.overrides), config.algo.unroll_length
     one = gmijax.plan(gmis_per_gpu=1)

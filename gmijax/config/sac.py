@@ -28,7 +28,7 @@ class SacConfig(PolicyConfig):
     name: Literal["sac"] = "sac"
     discounting: float = doc("discount factor per step, 0 to 1", low=0.0, high=1.0)
     n_step: int = doc(
-        "steps whose rewards a target sums before it takes the critics' word; fewer where an "
+        "steps whose rewards a target sums before it takes the critics' estimate; fewer where an "
         "episode ends",
         default=1,
         low=1,
@@ -45,11 +45,11 @@ class SacConfig(PolicyConfig):
         "multiple of it that divides unroll_length x updates_per_step",
         low=1,
     )
-    replay_steps: int = doc(
-        "steps of every environment that the replay holds, a multiple of unroll_length", low=2
-    )
+    replay_steps: int = doc("steps of every environment that the replay holds", low=2)
     learning_starts: int = doc(
-        "steps of every environment before the first update, also after a resume", low=2
+        "steps of every environment in the replay before the first update; a resumed run without "
+        "its replay makes as many first",
+        low=2,
     )
     replay_precision: Literal["float32", "float16"] = doc(
         "of observations and actions in the replay; float16 keeps the distance from the mean, "
@@ -113,11 +113,6 @@ class SacConfig(PolicyConfig):
     def _sizes(self, num_envs: int | None) -> Iterator[tuple[str, bool, str]]:
         """Keys, whether they are wrong, and what is allowed: of the replay and of updates."""
         length, updates, every = self.unroll_length, self.updates_per_step, self.policy_every
-        yield (
-            "replay_steps",
-            self.replay_steps % length != 0,
-            f"a multiple of algo.unroll_length={length}",
-        )
         in_round = updates % every == 0
         in_rounds = every % updates == 0 and length * updates % every == 0
         yield (
@@ -129,11 +124,12 @@ class SacConfig(PolicyConfig):
         most = self.replay_steps
         yield "n_step", self.n_step >= most, f"less than algo.replay_steps={most}"
         yield "learning_starts", self.learning_starts > most, f"at most algo.replay_steps={most}"
-        fewest = (num_envs or self.batch_size) * self.learning_starts
+        # None begins with the newest step, what follows that is not known yet.
+        fewest = (num_envs or self.batch_size) * (self.learning_starts - 1)
         yield (
             "batch_size",
             self.batch_size > fewest,
-            f"at most num_envs x algo.learning_starts = {fewest}",
+            f"at most num_envs x (algo.learning_starts - 1) = {fewest}",
         )
         yield (
             "replay_precision",

@@ -154,7 +154,7 @@ def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = 
     meta = dataclasses.replace(meta, files=checks, time_s=time.time())
     write_json(partial / META, meta.to_dict())
     _sync(partial)
-    if final.exists():  # A broken one, which a restart has passed over.
+    if final.exists():  # A broken one, which a restart has passed over; or one without replays.
         _remove(paths, final)
     os.replace(partial, final)
     _sync(final.parent)

@@ -226,9 +226,12 @@ class TrainingLoop:
             is_due = every and self._iterations % every == 0
             if not is_last and (is_due or (evaluation is not None and evaluation.is_best)):
                 self._save(state, memory, None, thread, evaluation)
-        # A replay can be many GiB: it is written once, where the run ends or is stopped.
+        self._save(state, memory, None, thread, evaluation)
         replay = None if self._remote else self._algorithm.replay(self._learner, memory)
-        self._save(state, memory, replay, thread, evaluation)
+        if replay is not None:
+            # It can be many GiB: written once, and last, since time or disk may not suffice for
+            # it. This checkpoint then takes the place of the one without it.
+            self._save(state, memory, replay, thread, evaluation)
         self._saver.finish()
         self._trace.close()  # Last: a job that is told to end has little time to save.
         return state, memory, stop
