@@ -5,86 +5,146 @@ two GMIs at the same time. The two GMIs exchange neither experience nor weights:
 GPU allows before anything is moved. Each acts or learns as fast as it can (`free`), or waits for
 the other so that the ratio of updates to steps is that of one program (`held`). The learner draws
 from a full replay. Adds a call to `benchmarks/results/off-policy-<task>-<device>.json`: rounds
-(steps of all environments) and updates of the critics per second.
+(steps of all environments) and updates of the critics per second, and how busy the GPU was.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import gmijax
 from benchmarks.records import ResultsFile, device_name, file_name
 from benchmarks.runner import exit_code, options
-from gmijax.config import SacConfig
+from gmijax.config import SacConfig, TrainConfig
 from gmijax.errors import ConfigError
+from gmijax.machine.nvidia import load_of
 
 LEAD = 2
 """Iterations that one of two GMIs may be ahead of the other where the ratio is held."""
+
+_SAMPLE_S = 0.1
+_SHOWN = (
+    *("batch_size", "updates_per_step", "policy_every", "unroll_length", "replay_steps"),
+    *("precision", "replay_precision", "critic_hidden_layer_sizes", "policy_hidden_layer_sizes"),
+)
+
+
+class Window(NamedTuple):
+    """A measurement: iterations per second, and the part of the time in which the GPU was busy.
+
+    NVML says the latter, of all processes together; None where it does not.
+    """
+
+    rate: float
+    utilisation: float | None = None
 
 
 class Alternating(gmijax.Role):
     """One GMI: both in turn in one program, then each alone."""
 
-    def run(self, overrides: tuple[str, ...], window_s: float) -> dict[str, float]:
-        """Iterations per second of each."""
+    def run(self, overrides: tuple[str, ...], window_s: float) -> dict[str, Window]:
+        """How fast each is."""
         from benchmarks.off_policy_programs import Programs
 
         programs = Programs(overrides)
         steps = {"both": programs.both, "act": programs.act, "learn": programs.learn}
-        return {name: free_rate(self, step, window_s) for name, step in steps.items()}
+        return {name: free_window(self, step, window_s) for name, step in steps.items()}
 
 
-class Beside(gmijax.Role):
+class Separate(gmijax.Role):
     """One of two GMIs: the first acts, the second learns."""
 
-    def run(self, overrides: tuple[str, ...], window_s: float) -> dict[str, float]:
-        """Iterations per second of this one, free and with the ratio held."""
+    def run(self, overrides: tuple[str, ...], window_s: float) -> dict[str, Window]:
+        """How fast this one is, free and with the ratio held."""
         from benchmarks.off_policy_programs import Programs
 
         programs = Programs(overrides)
         step = programs.act if self.rank == 0 else programs.learn
-        free = free_rate(self, step, window_s)
-        rates = self.collective(np.eye(2)[self.rank] * free, "sum")
+        free = free_window(self, step, window_s)
+        rates = self.collective(np.eye(2)[self.rank] * free.rate, "sum")
         count = max(LEAD + 1, int(window_s * min(rates)))  # The same on both: none waits in vain.
-        return {"free": free, "held": held_rate(self, step, count)}
+        with sampled_utilisation(self.rank) as samples:
+            held = held_rate(self, step, count)
+        return {"free": free, "held": Window(held, mean_of(samples))}
 
 
-def free_rate(role: gmijax.Role, step: Callable[[], None], window_s: float) -> float:
-    """Iterations per second in a window that all GMIs begin together."""
+@contextmanager
+def sampled_utilisation(rank: int) -> Iterator[list[float]]:
+    """Samples of the use of the first GMI's GPU while it is entered; none on the others."""
+    device, samples, is_over = os.environ.get("CUDA_VISIBLE_DEVICES"), [], threading.Event()
+
+    def sample() -> None:
+        while device and not is_over.wait(_SAMPLE_S) and (load := load_of(device)) is not None:
+            samples.append(load.busy)
+
+    thread = threading.Thread(target=sample, daemon=True)
+    if rank == 0:
+        thread.start()
+    try:
+        yield samples
+    finally:
+        is_over.set()
+        if rank == 0:
+            thread.join()
+
+
+def mean_of(samples: Sequence[float]) -> float | None:
+    """The mean, None of no samples."""
+    return statistics.fmean(samples) if samples else None
+
+
+def free_window(role: gmijax.Role, step: Callable[[], None], window_s: float) -> Window:
+    """A measurement that all GMIs begin together."""
     for _ in range(3):
         step()
     role.collective(0.0)
-    started_s, count = time.monotonic(), 0
-    while time.monotonic() - started_s < window_s:
-        step()
-        count += 1
-        role.progress(count)
-    return count / (time.monotonic() - started_s)
+    with sampled_utilisation(role.rank) as samples:
+        started_s, count = time.monotonic(), 0
+        while time.monotonic() - started_s < window_s:
+            step()
+            count += 1
+            role.progress(count)
+        rate = count / (time.monotonic() - started_s)
+    return Window(rate, mean_of(samples))
 
 
 def held_rate(role: gmijax.Role, step: Callable[[], None], count: int) -> float:
-    """The same of `count` iterations, no more than `LEAD` of them ahead of the other GMI."""
-    other, heard = 1 - role.rank, 0
+    """Iterations per second of `count`, no more than `LEAD` of them ahead of the other GMI."""
+    other, other_done = 1 - role.rank, 0
     role.collective(0.0)
     started_s = time.monotonic()
     for done in range(1, count + 1):
         step()
         role.send(done, other)
-        while done - heard >= LEAD:
-            heard = role.recv(other)
+        while done - other_done >= LEAD:
+            other_done = role.recv(other)
     return count / (time.monotonic() - started_s)
 
 
-def measured(given: argparse.Namespace, config: Any, backend: str) -> dict[str, Any]:
+def resolved(config: TrainConfig, algo: SacConfig) -> dict[str, Any]:
+    """What was measured, whatever the defaults are by then."""
+    drawn = algo.updates_per_step * algo.batch_size / config.envs_per_gmi
+    return {
+        "num_envs": config.envs_per_gmi,
+        "samples_per_transition": drawn,
+        "physics_impl": config.physics.impl,
+        **{key: getattr(algo, key) for key in _SHOWN},
+    }
+
+
+def measured(given: argparse.Namespace, config: Any, backend: Any) -> dict[str, Any]:
     """One repeat: rates of both ways, and how the second compares."""
     overrides, per_iteration = tuple(given.overrides), config.algo.unroll_length
     one = gmijax.plan(gmis_per_gpu=1)
@@ -94,28 +154,30 @@ def measured(given: argparse.Namespace, config: Any, backend: str) -> dict[str, 
             one, Alternating(), overrides, given.window_s, run_dir=f"{folder}/one"
         )
         agent, learner = gmijax.launch(
-            two, Beside(), overrides, given.window_s, run_dir=f"{folder}/two"
+            two, Separate(), overrides, given.window_s, run_dir=f"{folder}/two"
         )
     updates = per_iteration * config.algo.updates_per_step
-    held = min(agent["held"], learner["held"])
+    held = min(agent["held"].rate, learner["held"].rate)
     return {
         "backend": backend,
         "in_turn": {
-            "rounds_per_s": per_iteration * alone["both"],
-            "updates_per_s": updates * alone["both"],
-            "acting_alone_rounds_per_s": per_iteration * alone["act"],
-            "learning_alone_updates_per_s": updates * alone["learn"],
+            "rounds_per_s": per_iteration * alone["both"].rate,
+            "updates_per_s": updates * alone["both"].rate,
+            "acting_alone_rounds_per_s": per_iteration * alone["act"].rate,
+            "learning_alone_updates_per_s": updates * alone["learn"].rate,
+            "utilisation": {name: window.utilisation for name, window in alone.items()},
         },
         "two_gmis": {
-            "free_rounds_per_s": per_iteration * agent["free"],
-            "free_updates_per_s": updates * learner["free"],
+            "free_rounds_per_s": per_iteration * agent["free"].rate,
+            "free_updates_per_s": updates * learner["free"].rate,
             "held_rounds_per_s": per_iteration * held,
             "held_updates_per_s": updates * held,
+            "utilisation": {name: window.utilisation for name, window in agent.items()},
         },
         "gain": {
-            "rounds_free": agent["free"] / alone["both"],
-            "updates_free": learner["free"] / alone["both"],
-            "held": held / alone["both"],
+            "rounds_free": agent["free"].rate / alone["both"].rate,
+            "updates_free": learner["free"].rate / alone["both"].rate,
+            "held": held / alone["both"].rate,
         },
     }
 
@@ -146,11 +208,12 @@ def main() -> int:
     path = Path(given.out) / file_name(f"off-policy-{config.env.slug}", device_name())
     file = ResultsFile(path, "off_policy", vars(given))
     repeats: list[Mapping[str, Any]] = []
+    what = resolved(config, config.algo)
     for _ in range(given.repeats):
         for backend in given.backends:
             repeats.append(measured(given, config, backend))
             with file.changing() as results:
-                results.update(repeats=repeats, summary=summary(repeats))
+                results.update(resolved=what, repeats=repeats, summary=summary(repeats))
     for backend, gains in summary(repeats).items():
         shown = ", ".join(f"{name} {gain:.2f}x" for name, gain in gains.items())
         sys.stdout.write(f"{backend}: {shown} of one program, medians of {given.repeats}\n")

@@ -10,12 +10,13 @@ import jax
 import gmijax
 from gmijax.collectives.program import LocalCollectives
 from gmijax.config import SacConfig
-from gmijax.learning.learner import make_learner
+from gmijax.learning.learner import finish_iteration, make_learner
 from gmijax.learning.start import first_envs
-from gmijax.sac.replay import Replay
-from gmijax.sac.sac import iterate, step_into_replay
+from gmijax.learning.unroll import RolloutSums, merge_sums
+from gmijax.sac.replay import Replay, can_learn
+from gmijax.sac.sac import iterate, learn_after_turn, learn_in_round, step_into_replay
 from gmijax.sac.state import Memory, SacState, begin, init
-from gmijax.sac.updates import update_critics, update_policy
+from gmijax.sac.updates import SacLosses, UpdateFigures, losses_of
 from gmijax.types import PRNGKey
 from gmijax.workers.training_worker import environments
 
@@ -39,46 +40,52 @@ class Programs:
         envs = first_envs(self._env, config, 0)
         self._memory: Memory = jax.jit(partial(begin, self._learner, self._env))(envs)
         self._both = jax.jit(self._iterate, donate_argnums=(0, 1))
-        self._act = jax.jit(self._step, donate_argnums=1)
-        self._learn = jax.jit(self._update, donate_argnums=0)
-        # Units of a replay in half precision are there after the first iteration.
-        self.both()
-        for _ in range(config.algo.replay_steps // config.algo.unroll_length):
+        self._act = jax.jit(self._steps, donate_argnums=1)
+        self._learn = jax.jit(self._updates, donate_argnums=0)
+        self.both()  # The statistics of observations.
+        for _ in range(-(-config.algo.replay_steps // config.algo.unroll_length)):
             self.act()
+        replay = self._memory.replay
+        assert int(replay.filled) == config.algo.replay_steps
+        assert can_learn(replay, config.algo.learning_starts)
 
     def both(self) -> None:
         """Agents and learner in turn."""
-        self._state, self._memory = self._both(self._state, self._memory)
-        jax.block_until_ready(self._state)
+        self._state, self._memory, metrics = self._both(self._state, self._memory)
+        jax.block_until_ready((self._state, metrics))
 
     def act(self) -> None:
-        """The steps alone."""
-        self._memory = self._act(self._state, self._memory)
-        jax.block_until_ready(self._memory)
+        """The steps alone, and what an iteration sums of them."""
+        self._memory, self._sums = self._act(self._state, self._memory)
+        jax.block_until_ready((self._memory, self._sums))
 
     def learn(self) -> None:
-        """The updates alone."""
-        self._state = self._learn(self._state, self._memory.replay, jax.random.key(1))
-        jax.block_until_ready(self._state)
+        """The updates alone, with the latest statistics."""
+        self._state, losses = self._learn(self._state, self._memory.replay, self._sums)
+        jax.block_until_ready((self._state, losses))
 
-    def _iterate(self, state: SacState, memory: Memory) -> tuple[SacState, Memory]:
+    def _iterate(self, state: SacState, memory: Memory) -> tuple[SacState, Memory, Any]:
         env, learner = self._env, self._learner
-        return iterate(env, learner, LocalCollectives(), env.model, state, memory)[:2]
+        return iterate(env, learner, LocalCollectives(), env.model, state, memory)
 
-    def _step(self, state: SacState, memory: Memory) -> Memory:
-        def once(memory: Memory, _: None) -> tuple[Memory, Any]:
+    def _steps(self, state: SacState, memory: Memory) -> tuple[Memory, RolloutSums]:
+        def once(memory: Memory, _: None) -> tuple[Memory, RolloutSums]:
             return step_into_replay(self._env, self._learner, self._env.model, state, memory)
 
-        return jax.lax.scan(once, memory, length=self._config.unroll_length)[0]
+        memory, sums = jax.lax.scan(once, memory, length=self._config.unroll_length)
+        return memory, merge_sums(sums)
 
-    def _update(self, state: SacState, replay: Replay, key: PRNGKey) -> SacState:
+    def _updates(
+        self, state: SacState, replay: Replay, sums: RolloutSums
+    ) -> tuple[SacState, SacLosses]:
         local = self._learner, LocalCollectives(), replay
 
-        def turn(state: SacState, keys: PRNGKey) -> tuple[SacState, Any]:
-            state, figures = jax.lax.scan(partial(update_critics, *local), state, keys[1:])
-            state, loss = update_policy(*local, state, keys[0])
-            return state, (figures, loss)
+        def turn(state: SacState, keys: PRNGKey) -> tuple[SacState, UpdateFigures]:
+            state, figures = jax.lax.scan(partial(learn_in_round, *local), state, keys[1:])
+            return learn_after_turn(*local, state, figures, keys[0])
 
-        every = self._config.policy_every
-        turns = self._config.unroll_length * self._config.updates_per_step // every
-        return jax.lax.scan(turn, state, jax.random.split(key, (turns, every + 1)))[0]
+        length = self._config.rounds_per_turn
+        key = jax.random.fold_in(state.key, state.updates)
+        keys = jax.random.split(key, (self._config.unroll_length // length, length + 1))
+        state, figures = jax.lax.scan(turn, state, keys)
+        return finish_iteration(self._learner, state, sums.obs), losses_of(figures)

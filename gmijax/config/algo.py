@@ -25,6 +25,22 @@ class ValueNetwork(NamedTuple):
     is_normalized: bool
 
 
+class KeptReplay(NamedTuple):
+    """The replay of an algorithm that has one.
+
+    Attributes:
+      steps: of every environment that it holds.
+      starts: steps of every environment before the first update.
+      is_saved: whether the checkpoint at the end of a run holds it.
+      keys: on which it depends what is saved.
+    """
+
+    steps: int
+    starts: int
+    is_saved: bool
+    keys: tuple[str, ...]
+
+
 @dataclass(frozen=True, kw_only=True)
 class PolicyConfig(KeyGroup):
     """Keys of all algorithms: the length of rollouts, the policy, its optimiser."""
@@ -33,6 +49,8 @@ class PolicyConfig(KeyGroup):
     implementation: ClassVar[str] = ""
     """`module:name` of the `gmijax.learning.algorithm.Algorithm`, where every GMI simulates, acts
     and trains; jax is imported with it."""
+    fixed_keys: ClassVar[tuple[str, ...]] = ("activation", "state_dependent_std")
+    """What a resumed run cannot change, since its weights depend on it."""
     templates: ClassVar[tuple[Literal["tcg_ex", "tdg_ex", "decoupled"], ...]] = ("tcg_ex",)
     """Which GMIs have which role (`gmijax.partition.templates`), the first one by default."""
 
@@ -98,6 +116,11 @@ class PolicyConfig(KeyGroup):
     @property
     def value_network(self) -> ValueNetwork | None:
         """The value function, if there is one."""
+        return None
+
+    @property
+    def kept_replay(self) -> KeptReplay | None:
+        """The replay, if there is one."""
         return None
 
     @property

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from gmijax.config.algo import PolicyConfig
+from gmijax.config.algo import KeptReplay, PolicyConfig
 from gmijax.config.schema import doc
 from gmijax.errors import ConfigError
 
@@ -19,12 +19,16 @@ class SacConfig(PolicyConfig):
     """Hyper-parameters of SAC with many environments and large batches (arXiv:2512.01996)."""
 
     implementation = "gmijax.sac.sac:SAC"
+    fixed_keys = (
+        *PolicyConfig.fixed_keys,
+        *("critic_hidden_layer_sizes", "num_atoms", "value_range"),
+    )
 
     # algo= sets it.
     name: Literal["sac"] = "sac"
     discounting: float = doc("discount factor per step, 0 to 1", low=0.0, high=1.0)
     n_step: int = doc(
-        "steps whose rewards a target sums before it takes the critics' word; fewer where an "
+        "steps whose rewards a target sums before it takes the critics' estimate; fewer where an "
         "episode ends",
         default=1,
         low=1,
@@ -41,20 +45,20 @@ class SacConfig(PolicyConfig):
         "multiple of it that divides unroll_length x updates_per_step",
         low=1,
     )
-    replay_steps: int = doc(
-        "steps of every environment that the replay holds, a multiple of unroll_length", low=2
-    )
+    replay_steps: int = doc("steps of every environment that the replay holds", low=2)
     learning_starts: int = doc(
-        "steps of every environment before the first update, also after a resume", low=2
+        "steps of every environment in the replay before the first update; a resumed run without "
+        "its replay makes as many first",
+        low=2,
     )
     replay_precision: Literal["float32", "float16"] = doc(
-        "of observations and actions in the replay; float16 keeps observations in units of their "
-        "statistics after the first iteration, which is not learnt from",
+        "of observations and actions in the replay; float16 keeps the distance from the mean, "
+        "by the statistics of the time",
         default="float32",
     )
     save_replay: bool = doc(
-        "checkpoints hold the replay too, and a resumed run learns on with it; false: it fills "
-        "the replay anew first",
+        "the checkpoint at the end of a run, or where it is stopped, holds the replay too, and a "
+        "resumed run learns on with it; false, or after a fault: it fills the replay anew first",
         default=False,
     )
     critic_hidden_layer_sizes: tuple[int, ...] = doc("widths of each of the two critics", low=1)
@@ -72,6 +76,12 @@ class SacConfig(PolicyConfig):
         positive=True,
     )
     init_temperature: float = doc("weight of the entropy at first", positive=True)
+
+    @property
+    def kept_replay(self) -> KeptReplay:
+        """See `PolicyConfig`."""
+        keys = "replay_steps", "replay_precision"
+        return KeptReplay(self.replay_steps, self.learning_starts, self.save_replay, keys)
 
     @property
     def kept_steps(self) -> int:
@@ -103,11 +113,6 @@ class SacConfig(PolicyConfig):
     def _sizes(self, num_envs: int | None) -> Iterator[tuple[str, bool, str]]:
         """Keys, whether they are wrong, and what is allowed: of the replay and of updates."""
         length, updates, every = self.unroll_length, self.updates_per_step, self.policy_every
-        yield (
-            "replay_steps",
-            self.replay_steps % length != 0,
-            f"a multiple of algo.unroll_length={length}",
-        )
         in_round = updates % every == 0
         in_rounds = every % updates == 0 and length * updates % every == 0
         yield (
@@ -119,11 +124,12 @@ class SacConfig(PolicyConfig):
         most = self.replay_steps
         yield "n_step", self.n_step >= most, f"less than algo.replay_steps={most}"
         yield "learning_starts", self.learning_starts > most, f"at most algo.replay_steps={most}"
-        fewest = (num_envs or self.batch_size) * self.learning_starts
+        # None begins with the newest step, what follows that is not known yet.
+        fewest = (num_envs or self.batch_size) * (self.learning_starts - 1)
         yield (
             "batch_size",
             self.batch_size > fewest,
-            f"at most num_envs x algo.learning_starts = {fewest}",
+            f"at most num_envs x (algo.learning_starts - 1) = {fewest}",
         )
         yield (
             "replay_precision",

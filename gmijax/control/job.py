@@ -32,7 +32,13 @@ from gmijax.control.restarts import (
     with_gpus_left,
     with_nodes_left,
 )
-from gmijax.control.start_point import StartPoint, find_start_point, forgotten
+from gmijax.control.start_point import (
+    StartPoint,
+    find_start_point,
+    forgotten,
+    replay_line,
+    require_replay_fits,
+)
 from gmijax.control.summary import next_steps, train_outcome, train_summary
 from gmijax.control.wandb_link import followed, require_wandb
 from gmijax.errors import ConfigError
@@ -111,12 +117,13 @@ def _train(
     started_s: float,
 ) -> Result:
     config, plan = decided.config, decided.plan
+    require_replay_fits(config, plan, start_point.checkpoint)
     with opened(config, start_point) as (run, notes, folder):
         what = (
             f"{plan.num_envs_per_gmi} environments per GMI, template {plan.template}, reduction "
             f"{plan.strategy}"
         )
-        announce(console, run, plan, what, (*decided.reasons, *notes))
+        announce(console, run, plan, what, (*decided.reasons, *replay_line(config, plan), *notes))
         job = _TrainingJob(decided, run, folder, console, cluster, opengl)
         try:
             job.run_to_the_end(start_point, started_s)

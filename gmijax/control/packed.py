@@ -23,7 +23,12 @@ from gmijax.control.decide import decide
 from gmijax.control.job import opened, record_end, started_from
 from gmijax.control.progress import ConsoleProgress
 from gmijax.control.restarts import clear_unfinished, keep_logs
-from gmijax.control.start_point import find_start_point, forgotten
+from gmijax.control.start_point import (
+    find_start_point,
+    forgotten,
+    replay_line,
+    require_replay_fits,
+)
 from gmijax.control.summary import train_outcome
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
@@ -61,11 +66,13 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
     start_points = [find_start_point(config) for config in configs]
     console = open_console(show=show)
     config, plan, machine, reasons = decide(configs[0], console)
+    for start_point in start_points:
+        require_replay_fits(config, plan, start_point.checkpoint)
     gmis = RunPaths(folder)
     with ExitStack() as held:
         members: list[_Member] = []
         folders: list[OpenFolder] = []
-        notes = list(reasons)
+        notes = [*reasons, *replay_line(config, plan)]
         for own, start_point in zip(configs, start_points, strict=True):
             run, changes, its_folder = held.enter_context(opened(own, start_point))
             folders.append(its_folder)

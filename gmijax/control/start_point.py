@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from gmijax.config import AlgoConfig, EnvConfig, SacConfig, TrainConfig
+from gmijax.config import EnvConfig, TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
 from gmijax.partition.plan import Plan
@@ -102,32 +102,65 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
     return StartPoint(run, found.checkpoint, is_complete, notes)
 
 
+def replay_line(config: TrainConfig, plan: Plan) -> tuple[str, ...]:
+    """What the replays of a job hold, for its user; nothing where it has none."""
+    if (replay := config.algo.kept_replay) is None:
+        return ()
+    own = replay.steps * config.envs_per_gmi
+    each = "" if plan.layout.num_gmis == 1 else " in each GMI"
+    return (f"replay of {own:,} transitions{each} (MiB: replay/mib in the metrics)",)
+
+
 def forgotten(config: TrainConfig, plan: Plan) -> str | None:
     """What a job that goes on from a checkpoint has experienced and does not know any more.
 
     None where it goes on with all that it had, or had nothing.
     """
-    algo = config.algo
-    if config.run.resume is None or not isinstance(algo, SacConfig):
+    replay = config.algo.kept_replay
+    if config.run.resume is None or replay is None:
         return None
     checkpoint = Path(config.run.resume)
-    meta, before = CheckpointMeta.read(checkpoint), trained_config(checkpoint)[1]
-    was = meta.num_gmis, meta.num_envs, meta.impl
-    now = plan.layout.num_gmis, config.envs_per_gmi, config.physics.impl
     is_saved = _has_replay(checkpoint)
-    if algo.save_replay and is_saved and was == now:
-        return None
-    most = meta.num_gmis * meta.num_envs * getattr(before, "replay_steps", algo.replay_steps)
     if not is_saved:
-        why = "is not in the checkpoint (algo.save_replay=true keeps it)"
-    elif not algo.save_replay:
+        why = (
+            "is not in the checkpoint (algo.save_replay=true keeps it at the end of a run, or "
+            "where it is stopped)"
+        )
+    elif not replay.is_saved:
         why = "is left out with algo.save_replay=false"
-    else:
+    elif not _environments_go_on(config, plan, checkpoint):
         why = "is of another number of GMIs or environments, or of another physics.impl"
+    else:
+        return None
+    meta, before = CheckpointMeta.read(checkpoint), trained_config(checkpoint)[1].kept_replay
+    most = meta.num_gmis * meta.num_envs * (before or replay).steps
     return (
         f"the replay of {min(meta.env_steps, most):,} transitions {why}: it is filled for "
-        f"{algo.learning_starts} steps of every environment before learning goes on"
+        f"{replay.starts} steps of every environment before learning goes on"
     )
+
+
+def require_replay_fits(config: TrainConfig, plan: Plan, checkpoint: Path | None) -> None:
+    """Raises `ConfigError` where a job would go on with a saved replay of other sizes."""
+    replay = config.algo.kept_replay
+    if checkpoint is None or replay is None or not replay.is_saved:
+        return
+    if not _has_replay(checkpoint) or not _environments_go_on(config, plan, checkpoint):
+        return
+    saved = trained_config(checkpoint)[1]
+    for key in replay.keys:
+        have, want = getattr(saved, key), getattr(config.algo, key)
+        if have != want:
+            raise ConfigError(
+                f"algo.{key}={want}: the replay in the checkpoint has {have}; another is allowed "
+                "with algo.save_replay=false, which begins a new one"
+            )
+
+
+def _environments_go_on(config: TrainConfig, plan: Plan, checkpoint: Path) -> bool:
+    meta = CheckpointMeta.read(checkpoint)
+    was = meta.num_gmis, meta.num_envs, meta.impl
+    return was == (plan.layout.num_gmis, config.envs_per_gmi, config.physics.impl)
 
 
 def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> CheckpointMeta:
@@ -141,7 +174,10 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
         if have != want:
             raise ConfigError(f"run.resume={wanted}: checkpoint of {name} {have}, not {want}")
     trained, algo = trained_config(checkpoint)
-    _require_replay_fits(config, algo, checkpoint)
+    for key in config.algo.fixed_keys:
+        have, want = getattr(algo, key), getattr(config.algo, key)
+        if have != want:
+            raise ConfigError(f"algo.{key}={want}: a resumed run keeps its {have}")
     for key, have in _memory_of(trained).items():
         if have != _memory_of(config.env)[key]:
             want = getattr(config.env, key)
@@ -150,21 +186,6 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
     if config.seed != seed:
         raise ConfigError(f"seed={config.seed}: a resumed run keeps its seed {seed}")
     return meta
-
-
-def _require_replay_fits(config: TrainConfig, saved: AlgoConfig, checkpoint: Path) -> None:
-    algo = config.algo
-    if not isinstance(algo, SacConfig) or not isinstance(saved, SacConfig):
-        return
-    if not algo.save_replay or not _has_replay(checkpoint):
-        return
-    for key in ("replay_steps", "replay_precision"):
-        have, want = getattr(saved, key), getattr(algo, key)
-        if have != want:
-            raise ConfigError(
-                f"algo.{key}={want}: the replay in the checkpoint has {have}; another is allowed "
-                "with algo.save_replay=false, which begins a new one"
-            )
 
 
 def _has_replay(checkpoint: Path) -> bool:

@@ -104,6 +104,21 @@ def save_replay(paths: RunPaths, env_steps: int, gmi: int, replay: PyTree) -> No
     _save(_partial(paths, env_steps) / replay_name(gmi), replay)
 
 
+def require_disk_for(run: RunPaths, replay: PyTree | None, num_gmis: int) -> None:
+    """Raises `ConfigError` if the disk of a run has no room for the replays of so many GMIs.
+
+    `replay` may be shapes and dtypes; None: there is none to be saved.
+    """
+    leaves = jax.tree.leaves(replay)
+    need = num_gmis * sum(leaf.size * leaf.dtype.itemsize for leaf in leaves) / 2**20
+    if need and need > (free := shutil.disk_usage(run.root).free / 2**20):
+        raise ConfigError(
+            f"algo.save_replay=true: the replays take {need:,.0f} MiB at the end, and the disk of "
+            f"{run.root} has {free:,.0f} MiB left; lower algo.replay_steps, or set "
+            "algo.save_replay=false"
+        )
+
+
 def save_episodes(
     paths: RunPaths, env_steps: int, config: TrainConfig, window: Mapping[str, Any]
 ) -> None:
@@ -139,13 +154,34 @@ def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = 
     meta = dataclasses.replace(meta, files=checks, time_s=time.time())
     write_json(partial / META, meta.to_dict())
     _sync(partial)
-    if final.exists():  # A broken one, which a restart has passed over.
+    if final.exists():  # A broken one, which a restart has passed over; or one without replays.
         _remove(paths, final)
     os.replace(partial, final)
     _sync(final.parent)
     if keep is not None:
         _remove_old(paths, keep, final)
+    if any(final.glob(replay_name("*"))):
+        _remove_old_replays(paths, final)
     return final
+
+
+def _remove_old_replays(paths: RunPaths, last: Path) -> None:
+    """Replays are kept in one checkpoint alone: they are many times as large as all else."""
+    for checkpoint in checkpoints_of(paths.root):
+        replays = sorted(checkpoint.glob(replay_name("*")))
+        if checkpoint == last or not replays:
+            continue
+        # First the list of files, so that it is a whole checkpoint at any time.
+        meta = CheckpointMeta.read(checkpoint)
+        names = {path.name for path in replays}
+        files = {
+            name: check for name, check in meta.files.items() if name.split("/")[0] not in names
+        }
+        write_json(checkpoint / META, dataclasses.replace(meta, files=files).to_dict())
+        for path in replays:
+            hidden = path.with_name(f".{path.name}")
+            os.replace(path, hidden)
+            shutil.rmtree(hidden, ignore_errors=True)
 
 
 def _remove_old(paths: RunPaths, keep: int, last: Path) -> None:

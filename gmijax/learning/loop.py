@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Mapping
-from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -21,7 +20,7 @@ from gmijax.collectives.interface import Communicator, TracedStep
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveError
 from gmijax.learning.algorithm import Algorithm
-from gmijax.learning.checkpoint import require_equal
+from gmijax.learning.checkpoint import require_disk_for, require_equal
 from gmijax.learning.checkpoint_saver import CheckpointSaver
 from gmijax.learning.evaluator import Evaluation, Evaluator, evaluation_worlds
 from gmijax.learning.iteration_trace import IterationTrace
@@ -33,8 +32,9 @@ from gmijax.learning.throughput import ThroughputMeter
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.runs.result import TrainResult
 from gmijax.runs.resume import best_evaluation
-from gmijax.sim.wrappers import BatchedEnv
+from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.supervise.child import ChildLink
+from gmijax.types import PyTree
 
 
 class TrainingLoop:
@@ -148,21 +148,24 @@ class TrainingLoop:
         members, gmi, ranks = self._members, self._link.gmi, self._comm
         envs = members.stacked(
             lambda member: first_envs(
-                self._env, member.config, ranks.rank, gmi=gmi, num_gmis=ranks.world_size
+                *(self._env, member.config, ranks.rank),
+                gmi=gmi,
+                num_gmis=ranks.world_size,
+                num_runs=members.count,
             )
         )
-        begin = partial(self._algorithm.begin, self._learner, self._env)
-        template = self._algorithm.replay(self._learner, jax.eval_shape(members.each(begin), envs))
+
+        def begin(envs: BatchState, replay: PyTree | None) -> Any:
+            memory = self._algorithm.begin(self._learner, self._env, envs)
+            return memory if replay is None else self._algorithm.with_replay(memory, replay)
+
+        made = jax.eval_shape(members.each(begin), envs, None)
+        template = self._algorithm.replay(self._learner, made)
+        require_disk_for(members.first.run, template, ranks.world_size)
         replay = members.restored_replay(template, gmi, ranks.world_size)
-        if replay is None and members.is_one:
-            return begin(envs)
         # In a program, which makes a replay where it stays: there may be no room for another.
-        with_replay = self._algorithm.with_replay
-        if replay is None:
-            make = members.each(begin)
-            return jax.jit(make, donate_argnums=0)(envs)
-        make = members.each(lambda envs, replay: with_replay(begin(envs), replay))
-        return jax.jit(make, donate_argnums=(0, 1))(envs, jax.device_put(replay))
+        make = jax.jit(members.each(begin), donate_argnums=(0, 1))
+        return make(envs, jax.device_put(replay))
 
     def _compile(self, state: TrainState, memory: Any) -> float:
         """Makes all programs; returns the seconds for which others compiled."""
@@ -222,8 +225,13 @@ class TrainingLoop:
             is_last = stop or self._env_steps >= num_timesteps
             is_due = every and self._iterations % every == 0
             if not is_last and (is_due or (evaluation is not None and evaluation.is_best)):
-                self._save(state, memory, thread, evaluation)
-        self._save(state, memory, thread, evaluation)
+                self._save(state, memory, None, thread, evaluation)
+        self._save(state, memory, None, thread, evaluation)
+        replay = None if self._remote else self._algorithm.replay(self._learner, memory)
+        if replay is not None:
+            # It can be many GiB: written once, and last, since time or disk may not suffice for
+            # it. This checkpoint then takes the place of the one without it.
+            self._save(state, memory, replay, thread, evaluation)
         self._saver.finish()
         self._trace.close()  # Last: a job that is told to end has little time to save.
         return state, memory, stop
@@ -261,6 +269,7 @@ class TrainingLoop:
         self,
         state: TrainState,
         memory: Any,
+        replay: PyTree | None,
         thread: ReportThread,
         evaluation: Evaluation | None,
     ) -> None:
@@ -276,7 +285,7 @@ class TrainingLoop:
             state,
             learned,
             None if self._remote else self._algorithm.envs(memory),
-            None if self._remote else self._algorithm.replay(self._learner, memory),
+            replay,
             evaluation,
             is_leader=self._is_leader,
         )

@@ -116,6 +116,11 @@ class Members:
         return len(self._members) == 1
 
     @property
+    def count(self) -> int:
+        """How many runs there are."""
+        return len(self._members)
+
+    @property
     def going_on(self) -> list[Member]:
         """Those that have not failed."""
         return [member for member in self._members if member.error is None]
@@ -169,11 +174,13 @@ class Members:
     ) -> list[CheckpointPart]:
         """What a checkpoint holds of each run whose weights, `learned`, are finite.
 
-        All arguments may be donated afterwards.
+        All arguments may be donated afterwards, but for `replay`: of that there is no second copy
+        where the device is the host.
         """
         learned = jax.device_get(learned)
         learners = on_host(state) if is_leader else None
-        envs, replays = on_host(env_state), on_host(replay)  # None stays None.
+        envs = on_host(env_state)  # None stays None.
+        replays = jax.tree.map(np.asarray, replay)
         parts = []
         for number, member in enumerate(self._members):
             own, weights = (learners, envs, replays), learned

@@ -91,6 +91,7 @@ def first_envs(
     *,
     gmi: int | None = None,
     num_gmis: int | None = None,
+    num_runs: int = 1,
 ) -> BatchState:
     """Environments at their starts, or as a checkpoint has them.
 
@@ -103,6 +104,7 @@ def first_envs(
       place: number of this GMI among those that simulate.
       gmi: whose environments of a checkpoint to take, None for nobody's.
       num_gmis: only from a checkpoint of so many GMIs, None for any.
+      num_runs: that share the GMI; all of them have to fit.
 
     Raises:
       ConfigError: more environments than memory can hold.
@@ -119,6 +121,7 @@ def first_envs(
         kept_steps=algo.kept_steps,
         kept_itemsize=algo.kept_itemsize,
         kept_key=algo.kept_key,
+        num_runs=num_runs,
     )
     if resume is None or gmi is None or not envs_go_on(config, gmi, num_gmis):
         return env_state
@@ -168,11 +171,13 @@ def begin_episodes(
     kept_steps: int,
     kept_itemsize: int = 4,
     kept_key: str = "unroll_length",
+    num_runs: int = 1,
 ) -> BatchState:
     """Environments `first_env` to `first_env + num_envs - 1` of a job at their starts.
 
     `kept_steps` are the steps of all of them whose experience is in memory at once, with
     `kept_itemsize` bytes for each number of an observation or action; `kept_key` says how many.
+    There are `num_runs` times as many environments in memory as this makes.
 
     Raises:
       ConfigError: the state of so many environments, and their experience, which is the least
@@ -184,14 +189,18 @@ def begin_episodes(
     state = jax.tree.leaves(init.eval_shape(env.model, keys))
     step_bytes = kept_itemsize * (env.spec.obs_size + env.spec.action_size)
     step_bytes += jnp.dtype(jnp.float32).itemsize  # The reward.
-    least_bytes = sum(leaf.size * leaf.dtype.itemsize for leaf in state)
-    least_bytes += num_envs * kept_steps * step_bytes
+    env_bytes = num_runs * sum(leaf.size * leaf.dtype.itemsize for leaf in state)
+    all_step_bytes = num_runs * num_envs * step_bytes
+    least_bytes = env_bytes + kept_steps * all_step_bytes
     limit_bytes = _memory_bytes()
     if limit_bytes is not None and least_bytes > limit_bytes:
         need, have = (f"{num_bytes / 2**30:.3g} GiB" for num_bytes in (least_bytes, limit_bytes))
+        them = "them" if num_runs == 1 else f"those of {num_runs} runs"
+        most_steps = int((limit_bytes - env_bytes) / all_step_bytes)
+        fewer = f"{kept_key} up to {most_steps}, or " if most_steps > 0 else ""
         raise ConfigError(
-            f"num_envs={num_envs}: a GMI would need more than {need} for them and {kept_steps} "
-            f"steps of each ({kept_key}), and has {have}; allowed are less than "
+            f"num_envs={num_envs}: a GMI would need more than {need} for {them} and {kept_steps} "
+            f"steps of each ({kept_key}), and has {have}; allowed are {fewer}num_envs less than "
             f"{int(limit_bytes * num_envs / least_bytes)}"
         )
     starts = env_keys(key, first_env, num_envs)

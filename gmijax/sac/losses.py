@@ -59,7 +59,7 @@ def target_probs(
     next_log_prob: Array,
     temperature: Array,
 ) -> Array:
-    """What each critic shall say [2, B, Z]: its own target critic's returns after the rewards.
+    """Targets [2, B, Z] of each critic: its own target critic's returns after the rewards.
 
     Of several steps the entropy counts in the last state alone, as in FastTD3 and FlashSAC.
     """

@@ -15,30 +15,31 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from gmijax.learning.normalize import Moments, from_units, in_units, no_samples, with_std_floor
+from gmijax.learning.normalize import Moments, std_of
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array, PRNGKey
 
 GOES_ON, TERMINATED, CUT = 0, 1, 2
 """What follows a step: more of the episode, nothing, or what is not known."""
 
-_LEAST_UNIT = 1e-2
-"""Of observations in float16: that of an input that does not move at first is of a usual size, so
-that it is not out of range when it does."""
+_LEAST_UNIT = 1.0
+"""Of observations in float16. Smaller ones would gain nothing: float16 keeps 11 bits of any
+distance from the mean above 6e-5. An input that has not moved yet has its range then too."""
 
 
 class Replay(NamedTuple):
     """The ring.
 
     Attributes:
-      obs: [S, N, O] in `units`, float32 or float16.
+      obs: [S, N, O], float32 and raw, or float16 in the `units` of its row.
       action: [S, N, A], as the environment got it, of the same dtype.
       reward: [S, N] float32, unscaled.
       kind: [S, N] int8: `GOES_ON`, `TERMINATED` or `CUT`.
       head: [] int32, the row that is written next.
       filled: [] int32, rows that are written.
-      units: statistics of observations when the ring was begun; none, and observations are raw,
-        in float32, or where there were none.
+      units: [S, 2, O] float32, the number that stands for 0 in a row and the unit; [0, 2, O] in
+        float32.
+      num_clipped: [] float32, observed numbers so far that were out of the range of float16.
     """
 
     obs: Array
@@ -47,7 +48,8 @@ class Replay(NamedTuple):
     kind: Array
     head: Array
     filled: Array
-    units: Moments
+    units: Array
+    num_clipped: Array
 
 
 class Transitions(NamedTuple):
@@ -73,6 +75,7 @@ class Transitions(NamedTuple):
 def empty_replay(spec: EnvSpec, num_steps: int, num_envs: int, dtype: DTypeLike) -> Replay:
     """A ring of `num_steps` rows without transitions."""
     shape = num_steps, num_envs
+    rows_with_units = 0 if dtype == jnp.float32 else num_steps
     return Replay(
         obs=jnp.zeros((*shape, spec.obs_size), dtype),
         action=jnp.zeros((*shape, spec.action_size), dtype),
@@ -81,7 +84,8 @@ def empty_replay(spec: EnvSpec, num_steps: int, num_envs: int, dtype: DTypeLike)
         # An array each: both are donated.
         head=jnp.zeros((), jnp.int32),
         filled=jnp.zeros((), jnp.int32),
-        units=no_samples((spec.obs_size,)),
+        units=jnp.zeros((rows_with_units, 2, spec.obs_size), jnp.float32),
+        num_clipped=jnp.zeros((), jnp.float32),
     )
 
 
@@ -96,38 +100,36 @@ def kind_of(terminated: Array, truncated: Array, is_diverged: Array) -> Array:
     return jnp.where(is_diverged, CUT, kind).astype(jnp.int8)
 
 
-def with_units(replay: Replay, moments: Moments) -> Replay:
-    """The ring, begun anew in units of `moments` where it needs units and has none.
-
-    Float16 has 11 bits: of a height of 9.81 +- 0.01, raw, it would keep one digit. So what is
-    written until there are statistics is not learnt from.
-    """
-    if replay.obs.dtype == jnp.float32:
-        return replay
-    is_new = replay.units.count == 0
-    moments = with_std_floor(moments, _LEAST_UNIT)
-    units = jax.tree.map(lambda new, old: jnp.where(is_new, new, old), moments, replay.units)
-    head, filled = (jnp.where(is_new, 0, number) for number in (replay.head, replay.filled))
-    return replay._replace(units=units, head=head, filled=filled)
-
-
 def can_learn(replay: Replay, learning_starts: int) -> Array:
     """Whether [] there are so many rows to learn from."""
-    has_units = replay.obs.dtype == jnp.float32 or replay.units.count > 0
-    return (replay.filled >= learning_starts) & has_units
+    return replay.filled >= learning_starts
 
 
-def insert(replay: Replay, obs: Array, action: Array, reward: Array, kind: Array) -> Replay:
-    """The ring with T more rows [T, N, ...], of which S is a multiple; `obs` are raw."""
+def insert(
+    replay: Replay, moments: Moments, obs: Array, action: Array, reward: Array, kind: Array
+) -> Replay:
+    """The ring with T more rows [T, N, ...], of which S is a multiple; `obs` are raw.
+
+    In float16 the observations are kept in units of `moments`, the statistics at this time.
+    """
     num_steps, length = len(replay.obs), len(obs)
-    # Normalised observations are clipped far below; an infinity would become NaN there.
-    most = float(jnp.finfo(replay.obs.dtype).max)
-    obs = jnp.clip(in_units(replay.units, obs), -most, most)
 
     def written(ring: Array, rows: Array) -> Array:
         start = (replay.head, *(0,) * (ring.ndim - 1))
         return jax.lax.dynamic_update_slice(ring, rows.astype(ring.dtype), start)
 
+    units, num_clipped = replay.units, replay.num_clipped
+    if len(units):
+        # Each row has its own: statistics move far from what they were at the first steps.
+        unit = jnp.maximum(std_of(moments), _LEAST_UNIT)
+        units = written(
+            units, jnp.broadcast_to(jnp.stack([moments.mean, unit]), (length, *units.shape[1:]))
+        )
+        obs = (obs - moments.mean) / unit
+        # An infinity would become NaN when it is normalised.
+        most = float(jnp.finfo(replay.obs.dtype).max)
+        num_clipped += jnp.sum(jnp.abs(obs) > most, dtype=jnp.float32)
+        obs = jnp.clip(obs, -most, most)
     return replay._replace(
         obs=written(replay.obs, obs),
         action=written(replay.action, action),
@@ -135,6 +137,8 @@ def insert(replay: Replay, obs: Array, action: Array, reward: Array, kind: Array
         kind=written(replay.kind, kind),
         head=(replay.head + length) % num_steps,
         filled=jnp.minimum(replay.filled + length, num_steps),
+        units=units,
+        num_clipped=num_clipped,
     )
 
 
@@ -184,4 +188,8 @@ def sample_obs(replay: Replay, key: PRNGKey, batch_size: int) -> Array:
 
 def _observations(replay: Replay, row: Array, env: Array) -> Array:
     """[B, O] float32, raw."""
-    return from_units(replay.units, replay.obs[row, env].astype(jnp.float32))
+    obs = replay.obs[row, env].astype(jnp.float32)
+    if not len(replay.units):
+        return obs
+    zero, unit = replay.units[row, 0], replay.units[row, 1]
+    return zero + unit * obs

@@ -22,9 +22,9 @@ from gmijax.learning.learner import acting_weights, finish_iteration, make_learn
 from gmijax.learning.normalize import moments_of, without_outliers
 from gmijax.learning.unroll import RolloutSums, act, count, merge_sums, outcome_of, unroll
 from gmijax.sac.losses import CriticFigures
-from gmijax.sac.replay import Replay, can_learn, insert, kind_of, size_bytes, with_units
+from gmijax.sac.replay import Replay, can_learn, insert, kind_of, size_bytes
 from gmijax.sac.state import Memory, SacLearner, SacState, begin, init, num_averaged
-from gmijax.sac.updates import Learnt, losses_of, update_critics, update_policy
+from gmijax.sac.updates import UpdateFigures, losses_of, update_critics, update_policy
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
 from gmijax.types import Array, PRNGKey, PyTree
 
@@ -40,7 +40,6 @@ def iterate(
     """See `gmijax.learning.algorithm.Iterate`: T rounds of a step and its updates."""
     config = learner.config
     key = jax.random.fold_in(jax.random.fold_in(state.key, state.iteration), collectives.rank())
-    memory = memory._replace(replay=with_units(memory.replay, state.obs_moments))
     length = config.rounds_per_turn
     keys = jax.random.split(key, (config.unroll_length // length, length + 1))
     turn = partial(_turn, env, learner, collectives, model)
@@ -53,6 +52,7 @@ def iterate(
         **policy_figures(state),
         "policy/temperature": jnp.exp(state.log_temperature),
         "replay/steps": memory.replay.filled.astype(jnp.float32),
+        "replay/clipped": memory.replay.num_clipped,
         "replay/mib": jnp.asarray(size_bytes(memory.replay) / 2**20, jnp.float32),
     }
     return state, memory, IterationMetrics(counts, losses_of(losses), figures, {})
@@ -65,44 +65,31 @@ def _turn(
     model: PyTree,
     before: tuple[SacState, Memory],
     keys: PRNGKey,
-) -> tuple[tuple[SacState, Memory], tuple[RolloutSums, Learnt]]:
+) -> tuple[tuple[SacState, Memory], tuple[RolloutSums, UpdateFigures]]:
     """As many rounds as an update of the policy is made after; `keys` [rounds + 1]."""
-    one_round = partial(_round, env, learner, collectives, model)
-    (state, memory), (stats, learnt) = jax.lax.scan(one_round, before, keys[1:])
-    if learner.config.updates_per_step < learner.config.policy_every:
-        after, loss = update_policy(learner, collectives, memory.replay, state, keys[0])
-        state = _where(learnt.is_ready[-1], after, state)
-        learnt = learnt._replace(policy_loss=loss)
-    return (state, memory), (stats, learnt)
+
+    def one_round(before: tuple[SacState, Memory], key: PRNGKey) -> Any:
+        state, memory = before
+        memory, stats = step_into_replay(env, learner, model, state, memory)
+        state, figures = learn_in_round(learner, collectives, memory.replay, state, key)
+        return (state, memory), (stats, figures)
+
+    (state, memory), (stats, figures) = jax.lax.scan(one_round, before, keys[1:])
+    state, figures = learn_after_turn(learner, collectives, memory.replay, state, figures, keys[0])
+    return (state, memory), (stats, figures)
 
 
-def _round(
-    env: BatchedEnv,
-    learner: SacLearner,
-    collectives: Collectives,
-    model: PyTree,
-    before: tuple[SacState, Memory],
-    key: PRNGKey,
-) -> tuple[tuple[SacState, Memory], tuple[RolloutSums, Learnt]]:
-    """A step of all environments, and the updates after it."""
-    state, memory = before
-    memory, stats = step_into_replay(env, learner, model, state, memory)
-    after, figures, policy_loss = _learn(learner, collectives, memory.replay, state, key)
-    # The same on all GMIs, whose replays fill alike. Before, there is too little to learn from.
-    is_ready = can_learn(memory.replay, learner.config.learning_starts)
-    learnt = Learnt(figures, policy_loss, is_ready)
-    return (_where(is_ready, after, state), memory), (stats, learnt)
-
-
-def _learn(
+def learn_in_round(
     learner: SacLearner, collectives: Collectives, replay: Replay, state: SacState, key: PRNGKey
-) -> tuple[SacState, CriticFigures, Array | None]:
+) -> tuple[SacState, UpdateFigures]:
     """The updates after a step: of the policy too, if its turn comes as often."""
     num_updates, every = learner.config.updates_per_step, learner.config.policy_every
+    # The same on all GMIs, whose replays fill alike. Before, there is too little to learn from.
+    is_ready = can_learn(replay, learner.config.learning_starts)
     of_critics = partial(update_critics, learner, collectives, replay)
     if num_updates < every:
-        state, figures = jax.lax.scan(of_critics, state, jax.random.split(key, num_updates))
-        return state, figures, None
+        after, figures = jax.lax.scan(of_critics, state, jax.random.split(key, num_updates))
+        return _where(is_ready, after, state), UpdateFigures(figures, None, is_ready)
 
     def turn(state: SacState, keys: PRNGKey) -> tuple[SacState, tuple[CriticFigures, Array]]:
         state, figures = jax.lax.scan(of_critics, state, keys[1:])
@@ -110,8 +97,24 @@ def _learn(
         return state, (figures, loss)
 
     keys = jax.random.split(key, (num_updates // every, every + 1))
-    state, (figures, losses) = jax.lax.scan(turn, state, keys)
-    return state, figures, losses
+    after, (figures, losses) = jax.lax.scan(turn, state, keys)
+    return _where(is_ready, after, state), UpdateFigures(figures, losses, is_ready)
+
+
+def learn_after_turn(
+    learner: SacLearner,
+    collectives: Collectives,
+    replay: Replay,
+    state: SacState,
+    figures: UpdateFigures,
+    key: PRNGKey,
+) -> tuple[SacState, UpdateFigures]:
+    """The update of the policy after several rounds, where it is that rare; `figures` of them."""
+    if learner.config.updates_per_step >= learner.config.policy_every:
+        return state, figures
+    after, loss = update_policy(learner, collectives, replay, state, key)
+    state = _where(figures.is_ready[-1], after, state)
+    return state, figures._replace(policy_loss=loss)
 
 
 def _where(condition: Array, new: SacState, old: SacState) -> SacState:
@@ -139,7 +142,10 @@ def step_into_replay(
     )
     # Each observation counts once, when it is made: batches show the same ones again and again.
     seen = moments_of(without_outliers(weights.moments, obs), 2)
-    replay = insert(memory.replay, obs, action, reward, kind)
+    known = weights.moments
+    # The first iteration has its own statistics alone.
+    units = jax.tree.map(partial(jnp.where, known.count > 0), known, seen)
+    replay = insert(memory.replay, units, obs, action, reward, kind)
     return Memory(envs, replay), RolloutSums(seen, count(reward, outcomes))
 
 

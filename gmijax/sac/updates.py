@@ -32,7 +32,7 @@ from gmijax.types import Array, PRNGKey, PyTree
 _ENTROPY_OF_UNIT_STD = 0.5 * math.log(2.0 * math.pi * math.e)
 
 
-class Learnt(NamedTuple):
+class UpdateFigures(NamedTuple):
     """Of the updates of several rounds, with leading axes for what they were made in.
 
     Attributes:
@@ -63,14 +63,14 @@ class SacLosses(NamedTuple):
     end_atoms: Array
 
 
-def losses_of(learnt: Learnt) -> SacLosses:
-    """Of what was learnt in an iteration: turns of the policy and their rounds, [T', T'']."""
+def losses_of(updates: UpdateFigures) -> SacLosses:
+    """Of all updates in an iteration: turns of the policy and their rounds, [T', T'']."""
 
     def mean(values: Array, is_ready: Array) -> Array:
         each = jnp.mean(values.reshape(*is_ready.shape, -1), axis=-1)
         return jnp.sum(jnp.where(is_ready, each, 0.0)) / jnp.maximum(jnp.sum(is_ready), 1)
 
-    figures, policy_loss, is_ready = learnt
+    figures, policy_loss, is_ready = updates
     assert policy_loss is not None
     means = jax.tree.map(lambda values: mean(values, is_ready), figures)
     # Once in a turn, after its last round; or in every round.

@@ -45,7 +45,7 @@ ROWS: dict[str, tuple[str, ...]] = {
     "distill": ("algo.num_minibatches=2", "algo.teacher={teacher}"),
     "sac": (
         *("algo.batch_size=16", "algo.critic_hidden_layer_sizes=[16]", "algo.num_atoms=11"),
-        *("algo.replay_steps=8", "algo.learning_starts=4", "algo.updates_per_step=1"),
+        *("algo.replay_steps=10", "algo.learning_starts=4", "algo.updates_per_step=1"),
         *("algo.replay_precision=float16", "algo.save_replay=true", "algo.n_step=2"),
     ),
 }
@@ -123,6 +123,8 @@ def test_it_averages_what_it_says(case: Case) -> None:
     iterate = partial(case.algorithm.iterate, ENV, case.learner, Counting(), ENV.model)
     jax.eval_shape(iterate, case.first(0), case.memory())
     assert max(sizes) == case.algorithm.num_averaged(ENV.spec, case.config.algo)
+    # Updates of SAC are of the critics or of the policy.
+    assert len(set(sizes)) == (2 if case.config.algo.name == "sac" else 1)
 
 
 def test_runs_that_share_a_program_learn_what_they_do_alone(case: Case) -> None:

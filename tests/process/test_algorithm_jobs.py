@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from training_jobs import POINT, learner_arrays, train
 
+from gmijax.runs.resume import what_is_broken
+
 BASE = (
     *(POINT[0], "num_envs=16", "algo.unroll_length=4", "algo.policy_hidden_layer_sizes=[8]"),
     *("run.measure_throughput=false", "run.grace_s=3", "run.max_restarts=0"),
@@ -65,22 +67,35 @@ def test_two_gmis_learn_by_sac_and_fill_the_replay_anew_when_they_go_on(tmp_path
 @pytest.mark.timeout(300)
 def test_a_replay_that_is_saved_goes_on_with_its_run(tmp_path: Path) -> None:
     saved = ("algo.save_replay=true", "algo.replay_precision=float16", "algo.n_step=2")
-    line = ("plan.gpus=2", "run.checkpoint_every=3", "num_timesteps=1024")
-    done = train(*BASE, *SAC, *saved, *line, "run.dir=run", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    half = sorted((tmp_path / "run" / "checkpoints").iterdir())[0]
-    assert {path.name for path in half.glob("replay_*")} == {"replay_0", "replay_1"}
-    done = train(f"run.resume={half}", "run.dir=again", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "the replay of" not in done.stdout
-    again, whole = (learner_arrays(tmp_path / run) for run in ("again", "run"))
+    line = (*BASE, *SAC, *saved, "plan.gpus=2", "run.checkpoint_every=2")
+    for run, first, last in (("whole", None, 1024), ("again", None, 640), ("again", 640, 1024)):
+        auto = () if first is None else ("run.resume=auto",)
+        done = train(*line, *auto, f"run.dir={run}", f"num_timesteps={last}", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert "the replay of" not in done.stdout
+        checkpoints = sorted((tmp_path / run / "checkpoints").iterdir())
+        assert len(checkpoints) > 2
+        replays = [path.name for one in checkpoints for path in one.glob("replay_*")]
+        # Those of the end alone, also where another one came before.
+        assert sorted(replays) == ["replay_0", "replay_1"]
+        assert len(list(checkpoints[-1].glob("replay_*"))) == 2
+        assert all(what_is_broken(one) is None for one in checkpoints)
+    again, whole = (learner_arrays(tmp_path / run) for run in ("again", "whole"))
     for array, other in zip(again, whole, strict=True):
         np.testing.assert_array_equal(array, other)
+    half = checkpoints[-1]
     # What does not fit it is refused; so is one that is larger than the memory.
     resumed, most = (f"run.resume={half}", "run.dir=bad"), 16_000_000_000
+    longer = "num_timesteps=2048"
     for line, said in (
-        ((*resumed, "algo.replay_steps=32"), "algo.replay_steps=32: the replay in the checkpoint"),
-        ((*resumed, "algo.replay_precision=float32"), "algo.replay_precision=float32: the replay"),
+        (
+            (*resumed, longer, "algo.replay_steps=32"),
+            "algo.replay_steps=32: the replay in the checkpoint",
+        ),
+        (
+            (*resumed, longer, "algo.replay_precision=float32"),
+            "algo.replay_precision=float32: the replay",
+        ),
         (
             (*BASE, *SAC, "run.dir=big", f"algo.replay_steps={most}"),
             f"{most} steps of each (algo.",

@@ -39,14 +39,16 @@ def test_more_environments_than_memory_holds_are_refused_before_there_is_one(
 
 def test_what_fits_is_told_and_is_taken(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(start, "detect_host", lambda: HostLimits(memory_mib=1))
-    with pytest.raises(ConfigError, match="allowed are less than") as refused:
+    with pytest.raises(ConfigError, match=r"allowed are .*num_envs less than") as refused:
         begin(10**6)
     most = int(str(refused.value).rpartition(" ")[2])
     begin(most - 1)
     with pytest.raises(ConfigError, match=f"num_envs={most + 1}"):
         begin(most + 1)
-    with pytest.raises(ConfigError, match="8 steps of each"):
+    with pytest.raises(ConfigError, match=r"8 steps of each .* unroll_length up to [4-7], or"):
         begin(most - 1, kept_steps=8)
+    with pytest.raises(ConfigError, match="for those of 2 runs and 4 steps of each"):
+        start.begin_episodes(ENV, KEY, 7, most - 1, kept_steps=4, num_runs=2)
     monkeypatch.setattr(start, "detect_host", HostLimits)  # Unknown.
     begin(most + 1)
 

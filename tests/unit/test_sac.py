@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,7 @@ import gmijax
 from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.collectives.program import LocalCollectives
 from gmijax.errors import ConfigError
-from gmijax.learning.checkpoint import checkpoint_meta, on_host
+from gmijax.learning.checkpoint import checkpoint_meta, on_host, require_disk_for
 from gmijax.learning.checkpoint_saver import CheckpointPart, CheckpointSaver
 from gmijax.learning.episode_window import Standing
 from gmijax.learning.member import Member, Members
@@ -33,13 +34,11 @@ from gmijax.sac.replay import (
     GOES_ON,
     TERMINATED,
     Replay,
-    can_learn,
     empty_replay,
     insert,
     kind_of,
     sample,
     sample_obs,
-    with_units,
 )
 from gmijax.sac.sac import SAC
 from gmijax.sac.updates import target_entropy
@@ -76,7 +75,9 @@ def ring_of(num_inserted: int, lengths: list[int], ring: int) -> Replay:
     replay = empty_replay(spec, ring, len(lengths), jnp.float32)
     for first in range(0, num_inserted, 3):
         obs, kind = rows(first, 3, lengths)
-        replay = jax.jit(insert)(replay, obs, jnp.zeros((*kind.shape, 1)), obs[..., 1], kind)
+        replay = jax.jit(insert)(
+            replay, no_samples((2,)), obs, jnp.zeros((*kind.shape, 1)), obs[..., 1], kind
+        )
     return replay
 
 
@@ -160,7 +161,8 @@ def test_a_target_of_three_steps_ends_where_nothing_more_is_known(
     replay = empty_replay(EnvSpec("x", 1, 1, 0.0, 0, ()), 5, 1, jnp.float32)
     for row in range(len(kind)):
         obs = number[row : row + 1, :, None]
-        replay = insert(replay, obs, obs, 2.0 ** number[row : row + 1], kind[row : row + 1])
+        rewards = 2.0 ** number[row : row + 1]
+        replay = insert(replay, no_samples((1,)), obs, obs, rewards, kind[row : row + 1])
     drawn = jax.device_get(draw(replay, jax.random.key(0), 512, 3, 0.5))
     mine = np.flatnonzero(drawn.obs[:, 0] == 0.0)
     assert len(mine) > 20
@@ -173,35 +175,39 @@ def test_a_target_of_three_steps_ends_where_nothing_more_is_known(
         assert found.next_obs == [next_obs]
 
 
-def test_half_precision_keeps_small_changes_and_forgets_what_has_no_units() -> None:
-    spec, rng = EnvSpec("x", 3, 1, 0.0, 0, ()), np.random.default_rng(0)
-    # A height, one that has never moved so far, and one that is beyond what float16 can hold.
-    scale, shift = np.array([0.01, 0.0, 1e6]), np.array([9.81, 0.5, 0.0])
+def test_half_precision_keeps_small_changes_of_inputs_that_drift() -> None:
+    spec, rng = EnvSpec("x", 4, 1, 0.0, 0, ()), np.random.default_rng(0)
+    # A height, one that does not move at first, one that drifts far, one beyond float16's range.
+    scale, shift = np.array([0.01, 0.0, 0.01, 1e6]), np.array([9.81, 0.5, 0.0, 0.0])
 
     def made(num: int) -> np.ndarray:
-        return (shift + scale * rng.normal(size=(num, 2, 3))).astype(np.float32)
+        return (shift + scale * rng.normal(size=(num, 2, 4))).astype(np.float32)
 
-    def with_rows(replay: Replay, obs: np.ndarray) -> Replay:
+    replay = empty_replay(spec, 8, 2, jnp.float16)
+    rows = []
+    for _ in range(3):  # 12 rows: the first of them are overwritten.
+        obs = made(4)
         zeros = jnp.zeros(obs.shape[:2])
-        return insert(replay, obs, zeros[..., None] + 0.3, zeros, zeros.astype(jnp.int8))
-
-    replay = with_units(empty_replay(spec, 8, 2, jnp.float16), no_samples((3,)))
-    replay = with_rows(replay, made(4))
-    assert not can_learn(replay, 4)
-    moments = moments_of(made(400), 2)
-    replay = with_units(replay, moments)
-    assert int(replay.filled) == 0
+        args = zeros[..., None] + 0.3, zeros, zeros.astype(jnp.int8)
+        replay = insert(replay, moments_of(obs, 2), obs, *args)
+        rows.append(obs)
+        shift[2] += 1000.0
     obs = made(4)
-    obs[2, 0, 1] = 400.0
-    replay = with_units(with_rows(replay, obs), moments_of(10.0 * obs, 2))  # Has them by now.
-    assert can_learn(replay, 4)
+    obs[2, 0, 1] = 2000.0
+    replay = insert(replay, moments_of(rows[-1], 2), obs, *args)
+    assert float(replay.num_clipped) == 0.0
     found = np.asarray(sample_obs(replay, jax.random.key(0), 256))
-    for row in found:
-        error = np.abs(obs.reshape(-1, 3) - row) / np.array([0.01, 400.0, 1e6])
+    kept = np.concatenate([rows[-1], obs]).reshape(-1, 4)
+    for row in found:  # The last rows came with statistics from before a drift.
+        error = np.abs(kept - row) / np.array([0.01, 2000.0, 1000.0, 1e6])
         assert error.max(axis=1).min() < 2e-3
+        if row[2] < 2500.0:
+            assert np.abs(rows[-1].reshape(-1, 4)[:, 2] - row[2]).min() < 1e-3
     drawn = draw(replay, jax.random.key(0), 64, 1, 0.5)
     assert drawn.obs.dtype == drawn.action.dtype == jnp.float32
     np.testing.assert_allclose(drawn.action, 0.3, rtol=1e-3)
+    obs[0, 0, 1] = -1e6
+    assert float(insert(replay, moments_of(rows[-1], 2), obs, *args).num_clipped) == 1.0
 
 
 def test_what_follows_a_step() -> None:
@@ -292,7 +298,7 @@ def run_of(learner: Any, iterations: int) -> Any:
 def test_each_part_learns_when_it_is_its_turn() -> None:
     learner = learner_of(
         *("algo.policy_every=2", "algo.updates_per_step=1", "algo.learning_starts=4"),
-        *("algo.target_rate=1.0", "algo.unroll_length=2"),
+        *("algo.target_rate=1.0", "algo.unroll_length=2", "algo.batch_size=48"),
     )
     for number, (before, after, metrics) in enumerate(run_of(learner, 4), start=1):
         # Of four rows, a critic learns in the last; the policy after every second.
@@ -314,7 +320,7 @@ def test_the_policy_learns_once_after_so_many_updates(
     """Counted while it runs: none is made and not used."""
     learner = learner_of(
         *(f"algo.updates_per_step={updates}", f"algo.policy_every={every}"),
-        *("algo.unroll_length=4", "algo.learning_starts=4"),
+        *("algo.unroll_length=4", "algo.learning_starts=4", "algo.batch_size=48"),
     )
     made: list[str] = []
 
@@ -365,6 +371,18 @@ def test_several_runs_get_back_the_replays_that_are_theirs(tmp_path: Path) -> No
     assert Members(members, 0).restored_replay(template, 0, 2) is None
 
 
+def test_a_replay_that_the_disk_has_no_room_for_is_refused(tmp_path: Path) -> None:
+    run, free = RunPaths(tmp_path), shutil.disk_usage(tmp_path).free
+    fits, half = (
+        {"x": jax.ShapeDtypeStruct((size,), jnp.float16)} for size in (free // 8, free // 3)
+    )
+    require_disk_for(run, fits, 2)
+    require_disk_for(run, None, 2)
+    require_disk_for(run, half, 1)
+    with pytest.raises(ConfigError, match=r"^algo.save_replay=true: the replays take .* MiB left"):
+        require_disk_for(run, half, 2)
+
+
 def test_it_learns_and_says_where_the_range_of_returns_is_too_small() -> None:
     *_, (_, _, last) = run_of(learner_of("algo.learning_rate=1e-3"), 300)
     assert float(last.counts.reward_sum) / 16 > 0.5  # At first it is about -0.4.
@@ -376,7 +394,6 @@ def test_it_learns_and_says_where_the_range_of_returns_is_too_small() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("algo.replay_steps=63 algo.unroll_length=2", "algo.replay_steps=63: .* a multiple of"),
         (
             "algo.policy_every=3",
             "algo.policy_every=3: .* a divisor of algo.upd.*=2, or",
@@ -389,7 +406,7 @@ def test_it_learns_and_says_where_the_range_of_returns_is_too_small() -> None:
             "algo.replay_precision=float16: .* float32 where algo.normalize_observations=false",
         ),
         ("algo.learning_starts=65", "algo.learning_starts=65: .* at most algo.replay_steps=64"),
-        ("algo.batch_size=200", "algo.batch_size=200: .* at most num_envs x .* = 160"),
+        ("algo.batch_size=150", "algo.batch_size=150: .* at most num_envs x .* = 144"),
         ("algo.target_std=0.6", "algo.target_std=0.6: .* at most 0.479"),
         ("algo.distribution_type=normal", "algo.distribution_type=normal: .* tanh_normal"),
         ("algo.preserve_outputs=true", "algo.preserve_outputs=True: .* false"),

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from supervision import save
+from supervision import save, save_meta
 
 import gmijax
 from gmijax.cli.compose import compose
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.config.schema import flatten, to_dict
 from gmijax.control import decide, serving
-from gmijax.control.start_point import find_start_point
+from gmijax.control.start_point import (
+    find_start_point,
+    forgotten,
+    replay_line,
+    require_replay_fits,
+)
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import META, RunPaths, read_json, write_json
+from gmijax.runs.resume import CheckpointMeta
 
 
 def config_of(folder: Path, *overrides: str) -> TrainConfig:
@@ -81,6 +89,57 @@ def test_auto_refuses_other_networks_and_another_seed(run: RunPaths):
         find_start_point(config_of(run.root, "algo.policy_hidden_layer_sizes=[9]"))
     with pytest.raises(ConfigError, match="seed=7: a resumed run keeps its seed 0"):
         find_start_point(config_of(run.root, "seed=7"))
+
+
+@pytest.mark.parametrize("key", ["activation=layer_norm_silu", "state_dependent_std=true"])
+def test_auto_refuses_another_kind_of_network(run: RunPaths, key: str):
+    save(run, 100)
+    with pytest.raises(
+        ConfigError, match=f"^algo.{key}.*: a resumed run keeps its ".replace("true", "True")
+    ):
+        find_start_point(config_of(run.root, f"algo.{key}"))
+
+
+@pytest.mark.parametrize(
+    "key", ["critic_hidden_layer_sizes=[9]", "num_atoms=51", "value_range=7.0", "activation=elu"]
+)
+def test_auto_refuses_other_critics(tmp_path: Path, key: str):
+    paths, line = RunPaths(tmp_path / "run"), ("env=ant", "algo=sac", "run.resume=auto")
+    line = (*line, f"run.dir={paths.root}")
+    write_json(paths.config, to_dict(config := compose(*line)))
+    hidden = config.algo.hidden_layer_sizes
+    checkpoint = save_meta(paths, CheckpointMeta("ant", "sac", 100, 1, 8, hidden, "jax"))
+    assert find_start_point(config).checkpoint == checkpoint
+    name = key.partition("=")[0]
+    with pytest.raises(ConfigError, match=f"^algo.{name}=.*: a resumed run keeps its "):
+        find_start_point(compose(*line, f"algo.{key}"))
+
+
+def test_a_saved_replay_has_to_fit_only_where_it_is_gone_on_with(tmp_path: Path):
+    run = RunPaths(tmp_path / "run")
+    line = ("env=ant", "algo=sac", "num_envs=1024", "physics.impl=jax", "algo.save_replay=true")
+    write_json(run.config, to_dict(config := compose(*line)))
+    hidden = config.algo.hidden_layer_sizes
+    checkpoint = save_meta(run, CheckpointMeta("ant", "sac", 4096, 2, 1024, hidden, "jax"))
+    (checkpoint / "replay_0").mkdir()
+    for num_gmis, key, is_refused, is_forgotten in (
+        (2, "replay_steps=1024", False, False),
+        (2, "replay_steps=512", True, False),
+        (2, "replay_precision=float16", True, False),
+        (2, "save_replay=false", False, True),
+        (1, "replay_steps=512", False, True),
+    ):
+        plan: Any = SimpleNamespace(layout=SimpleNamespace(num_gmis=num_gmis))
+        own = compose(*line, f"run.resume={checkpoint}", f"algo.{key}")
+        with (
+            pytest.raises(ConfigError, match=f"algo.{key}: the replay in the checkpoint")
+            if (is_refused)
+            else nullcontext()
+        ):
+            require_replay_fits(own, plan, checkpoint)
+        assert (forgotten(own, plan) is not None) == is_forgotten
+    [line] = replay_line(own, plan)
+    assert line.startswith("replay of 524,288 transitions (MiB")
 
 
 def test_auto_leaves_a_folder_with_something_else_alone(tmp_path: Path):
