@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from gmijax.config import EnvConfig
 from gmijax.config.env import ROBOTS as NAMES
+from gmijax.sim.robots import robot_name
 
 Floats = npt.NDArray[np.float32]
 
@@ -94,9 +95,8 @@ def robot_of(env: EnvConfig) -> Robot | None:
     """The robot of one of Playground's joystick tasks, None of another task."""
     if env.suite != "playground":
         return None
-    names = {theirs: name for name, theirs in NAMES.items()}
-    name = names.get(str(env.name), str(env.name))
-    return ROBOTS.get(name.removesuffix("_rough"))
+    name = robot_name(str(env.name))
+    return None if name is None else ROBOTS[name.removesuffix("_rough")]
 
 
 def with_pushes(env: EnvConfig, robot: Robot) -> EnvConfig:
