@@ -123,6 +123,7 @@ def measure(steps: Recording, robot: Robot, ground: Ground, control_dt_s: float)
     has_fallen, has_left = _which_first(fallen, left)
     settled = running & _settled(steps.disturbed, control_dt_s)
     upright, share_left = _share(has_fallen, has_left), float(has_left.mean())
+    loads = _loads(steps.load[running])
     errors, num_envs = _errors(steps, settled), running.shape[1]
     return Walk(
         walks=_walks(upright, share_left, errors) if num_envs >= LEAST_ENVS else None,
@@ -135,7 +136,8 @@ def measure(steps: Recording, robot: Robot, ground: Ground, control_dt_s: float)
         settled=errors,
         all_steps=_errors(steps, running),
         jerk_rad_per_s3=_jerk(steps.qpos[..., 7:], running, control_dt_s),
-        **_loads(steps.load[running]),
+        load_rms=loads["load_rms"],
+        load_p99=loads["load_p99"],
     )
 
 

@@ -83,10 +83,14 @@ def _whole(folder: Path) -> Path | None:
 
 def _clone() -> Path | None:
     """Where Playground itself clones all models to, if one has used it without gmijax."""
+    package = playground_folder()
+    return None if package is None else package / "external_deps" / "mujoco_menagerie"
+
+
+def playground_folder() -> Path | None:
+    """The folder of the package `mujoco_playground`, None if it is not installed."""
     spec = importlib.util.find_spec("mujoco_playground")
-    if spec is None or spec.origin is None:
-        return None
-    return Path(spec.origin).parent / "external_deps" / "mujoco_menagerie"
+    return None if spec is None or spec.origin is None else Path(spec.origin).parent
 
 
 def how_to_get(names: Sequence[str]) -> str:
