@@ -226,8 +226,3 @@ def changed_settings(env: EnvConfig) -> dict[str, float]:
         for name, value in env.settings.items()
         if value != defaults.get(name) and name != "push" and not name.endswith(".enable")
     }
-
-
-def has_randomizer(task: str) -> bool:
-    """Whether Playground brings domain randomisation for a task, by its name there."""
-    return task.startswith(("Aero", "Berkeley", "G1", "Go1", "Leap", "T1"))

@@ -28,8 +28,8 @@ from gmijax.player.walking import Recording, measure
 from gmijax.sim.interface import Env
 from gmijax.sim.randomize import make_worlds, randomized
 from gmijax.sim.registry import make_env, require_env
-from gmijax.sim.robot_models import models_of
-from gmijax.sim.robots import ROBOT_SETTINGS, has_randomizer
+from gmijax.sim.robot_models import has_randomizer, models_of
+from gmijax.sim.robots import ROBOT_SETTINGS
 from gmijax.sim.wrappers import BatchState, StepOutput, training_env
 from gmijax.workers.exporter import names_of
 

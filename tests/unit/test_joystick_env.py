@@ -7,6 +7,8 @@ import importlib
 import importlib.util
 import json
 import runpy
+import time
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -193,7 +195,8 @@ def test_pushes_are_forces_of_go1_and_changes_of_velocity_of_g1(models):
     mass_kg = env.model.body_subtreemass[1]
     ends = [number for number in begins if number + 12 < len(forces)]
     changes = [sum(forces[number : number + 12]) * 0.02 / mass_kg for number in ends]
-    drawn = env._pusher._size
+    pusher: Any = env._pusher
+    drawn = pusher._size
     assert changes == pytest.approx([drawn / np.pi] * len(ends), rel=0.2)
     others = np.delete(np.arange(env.model.nbody), env.model.body("trunk").id)
     pushed_others = set()
@@ -281,6 +284,15 @@ def test_the_example_prints_the_walking_test(models, monkeypatch, capsys):
         monkeypatch.setattr("sys.argv", ["sim2sim.py", "policy.onnx", *options])
         with pytest.raises(ConfigError, match=r"at least --envs 1 and --seconds 0\.02$"):
             example["main"]()
+    left = iter([True] * 60 + [False])  # The window is closed after 60 steps.
+    window = SimpleNamespace(is_running=lambda: next(left), sync=lambda: None)
+    viewer = SimpleNamespace(launch_passive=lambda model, data: nullcontext(window))
+    monkeypatch.setattr("mujoco.viewer", viewer, raising=False)
+    monkeypatch.setattr("sys.argv", ["sim2sim.py", "policy.onnx", "--view", "--seconds", "1"])
+    started_s = time.monotonic()
+    assert example["main"]() == 0
+    assert next(left, None) is None
+    assert time.monotonic() - started_s > 60 * about["control_dt_s"], "in real time"
     policy.metadata = {}
     with pytest.raises(ConfigError, match="not a policy of env=go1"):
         example["main"]()
