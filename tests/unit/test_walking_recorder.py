@@ -15,7 +15,7 @@ import pytest
 
 import gmijax
 from gmijax.learning.learner import init_learner, make_learner
-from gmijax.learning.walking import WalkingTest
+from gmijax.learning.walking import WalkingTest, act_of
 from gmijax.player import walking
 from gmijax.player.joystick import ROBOTS, Readings
 from gmijax.sim.interface import Env, EnvSpec, EnvState
@@ -218,6 +218,11 @@ def test_playing_tests_the_policy_of_the_checkpoint(monkeypatch):
     assert (found["num_envs"], found["length_s"], found["walks"]) == (2, 20.0, None)
     assert found["settings"] == {"noise": 0.5}
     assert found["falls"] == {"not_finite": 0, "low": 0, "tilted": 0, "done": 2}
+    # Observations count the steps, torques are the actions; a fall is seen in the 55th step.
+    actions = act_of(learner)(state, jnp.arange(54, dtype=jnp.float32)[:, None])
+    loads = np.asarray(actions) / [3, 5]
+    assert found["load_rms"] == pytest.approx(np.sqrt((loads**2).mean()), rel=1e-4)
+    assert np.std(loads) > 1e-3
     assert beats[:2] == [("compiling", 0), ("running", 1)]
     assert beats[-1] == ("running", 20)
     assert walk(walking_envs=0) is None
