@@ -32,7 +32,7 @@ LEAST_UPRIGHT: Final = 0.99
 MOST_LINEAR_ERROR_M_PER_S: Final = 0.25
 MOST_YAW_ERROR_RAD_PER_S: Final = 0.25
 MOST_LEFT: Final = 0.5
-"""Of the environments may leave the field: what is known of a policy is known of the others."""
+"""Most of the environments that may leave the field: the others say how the policy walks."""
 
 LEAST_ENVS: Final = 100
 """With fewer environments 99 % cannot be told from less, and the test does not decide."""

@@ -54,7 +54,7 @@ def walk_of(parts, model: Any = Flat):
     return measure(Recording(**parts), GO1, Ground(model), DT_S)
 
 
-def test_a_robot_that_stands_as_it_is_told_to_walks():
+def test_a_robot_that_stands_as_commanded_walks():
     walk = walk_of(standing(envs=100))
     assert walk.walks is True
     assert (walk.num_envs, walk.length_s, walk.upright, walk.left) == (100, 4.0, 1.0, 0.0)
