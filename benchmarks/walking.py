@@ -1,21 +1,24 @@
 r"""Seconds until a robot walks: `python -m benchmarks.walking env=go1 --seeds 5`.
 
 Trains with checkpoints on the way, then puts them through the walking test, so that no test costs
-training time. A training walks from the first checkpoint on of which two in a row walk, or from
-the last one. Its seconds run from the start of the command until the checkpoint is written, and
-apart from that from the first step until the policy is there. Programs are compiled before, in a
-short training; with `--cold` every training compiles all of them.
+training time. A training walks from the first checkpoint on of which two in a row walk. Its
+seconds run from the start of the command until the checkpoint is written, and apart from that from
+the first step until the policy is there. Programs are compiled before, in a short training; with
+`--cold` every training compiles all of them.
 
     python -m benchmarks.walking env=go1 num_timesteps=60e6 --seeds 5
     python -m benchmarks.walking env=g1 --script='--impl=warp --num_timesteps=200000000'
 
 `--script` trains with Playground's own script (Brax's PPO) too, in turn with ours, with its own
-settings but for these flags. Adds a call to `benchmarks/results/walking-<task>-<device>.json`.
+settings but for these flags. Its short training has as many steps as it makes between two
+evaluations: their number is part of its program. Adds a call to
+`benchmarks/results/walking-<task>-<device>.json`.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import shlex
 import shutil
 import statistics
@@ -23,6 +26,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +38,11 @@ from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
 from gmijax.player.joystick import robot_of
-from gmijax.player.walking import NUM_ENVS
+from gmijax.player.walking import LEAST_ENVS, NUM_ENVS
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.history import read_metrics
 from gmijax.runs.resume import CheckpointMeta, checkpoints_of
-from gmijax.sim.robots import playground_name
+from gmijax.sim.robots import playground_name, robot_name
 
 OURS, SCRIPT = "gmijax", "train-jax-ppo"
 BRAX_CONFIG = "ppo_network_config.json"
@@ -78,7 +82,10 @@ class Benchmark:
     def _train(self, trainer: str, name: str, *, is_short: bool = False) -> dict[str, Any]:
         """One training as a whole command, and its checkpoints."""
         folder = self._scratch / f"{trainer}-{name}"
-        folder.mkdir(parents=True)
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            raise ConfigError(f"--runs={self._given.runs}: has a {folder.name} already") from None
         cache = folder if self._given.cold else self._scratch
         variables = {"JAX_COMPILATION_CACHE_DIR": str(cache / "xla")}
         if trainer == OURS:
@@ -100,44 +107,57 @@ class Benchmark:
         assert isinstance(config.num_envs, int)
         per_iteration = config.num_envs * getattr(config.algo, "unroll_length", 1)
         every = max(1, config.num_timesteps // per_iteration // self._given.tests)
-        told = [
+        overrides = [
             *("plan.gpus=1", "plan.gmis_per_gpu=1", "run.measure_throughput=false"),
             *(f"run.checkpoint_every={every}", "run.keep_checkpoints=null"),
             *(*self._given.overrides, f"run.dir={folder / 'run'}"),
             "num_timesteps=1" if is_short else f"seed={seed}",
         ]
-        return [sys.executable, "-m", "gmijax.train", *told]
+        return [sys.executable, "-m", "gmijax.train", *overrides]
 
     def _script_command(self, folder: Path, seed: str, *, is_short: bool) -> list[str]:
-        told = [
+        given = [f"--num_evals={self._given.tests + 1}", *shlex.split(self._given.script)]
+        flags = [
             f"--env_name={playground_name(str(self._config.env.name))}",
-            *(f"--num_evals={self._given.tests + 1}", f"--logdir={folder}", "--num_videos=1"),
-            *shlex.split(self._given.script),
-            # Fewer steps than its first part has, so that it makes that alone.
-            *(("--num_timesteps=1", "--num_evals=2") if is_short else (f"--seed={seed}",)),
+            *(f"--logdir={folder}", "--num_videos=1", *given),
+            *(self._short_flags(given) if is_short else (f"--seed={seed}",)),
         ]
-        return [sys.executable, "-m", "benchmarks.peers.playground_script", *told]
+        return [sys.executable, "-m", "benchmarks.peers.playground_script", *flags]
+
+    def _short_flags(self, given: Sequence[str]) -> tuple[str, ...]:
+        """Of one part of the script's training: of as many steps as each of them has."""
+        flags = script_flags(given)
+        shipped = gmijax.compose(f"env={robot_name(str(self._config.env.name))}")
+        steps = flags.num_timesteps or shipped.num_timesteps
+        parts = max(1, flags.num_evals - 1)
+        return f"--num_timesteps={math.ceil(steps / parts)}", "--num_evals=2"
 
     def _test(self) -> None:
         """All checkpoints, in a process of their own."""
         given, out = self._given, self._scratch / "walks.json"
         asked = {
             "env": to_dict(self._config.env),
-            "impl": self._config.physics.impl,
             "num_envs": given.envs,
             "seed": given.test_seed,
             "runs": [[one["folder"] for one in run["checkpoints"]] for run in self.runs],
+            "impls": [self._impl(run["trainer"]) for run in self.runs],
         }
         write_json(self._scratch / "tests.json", asked)
         module = [sys.executable, "-m", "benchmarks.walking_tests"]
         command = [*module, str(self._scratch / "tests.json"), str(out)]
         cache = {"JAX_COMPILATION_CACHE_DIR": str(self._scratch / "xla")}
-        self._code_of_tests = code = run_command(command, self._deadline_s, cache)
+        self._code_of_tests = run_command(command, self._deadline_s, cache)
         found = read_json(out)["walks"] if out.exists() else [[] for _ in self.runs]
         for run, walks in zip(self.runs, found, strict=True):
             for checkpoint, walk in zip(run["checkpoints"], walks, strict=False):
                 checkpoint["walk"] = walk
-            run["walks_from"] = walks_from(run["checkpoints"], is_complete=code == 0)
+            run["walks_from"] = walks_from(run["checkpoints"])
+
+    def _impl(self, trainer: str) -> str:
+        """What a trainer was asked for as physics."""
+        if trainer == OURS:
+            return self._config.physics.impl
+        return script_flags(shlex.split(self._given.script)).impl
 
     def _write(self) -> None:
         rows = summary(self.runs)
@@ -149,15 +169,20 @@ class Benchmark:
             results.update(task=self._config.env.label, rows=rows, runs=runs)
 
 
-def walks_from(
-    checkpoints: Sequence[Mapping[str, Any]], *, is_complete: bool
-) -> dict[str, Any] | None:
+def script_flags(given: Sequence[str]) -> argparse.Namespace:
+    """Those of the script's flags that are wanted here, with its defaults (Playground 0.2.0)."""
+    parser = argparse.ArgumentParser(allow_abbrev=False, add_help=False)
+    parser.add_argument("--num_timesteps", type=lambda text: int(float(text)))
+    parser.add_argument("--num_evals", type=int)
+    parser.add_argument("--impl", default="jax")
+    return parser.parse_known_args(given)[0]
+
+
+def walks_from(checkpoints: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """The checkpoint from which on a training walks, None without one; see the module."""
     tested = [one for one in checkpoints if "walk" in one]
-    for number, one in enumerate(tested):
-        after = tested[number + 1 : number + 2]
-        is_last = is_complete and number == len(checkpoints) - 1
-        if one["walk"]["walks"] and (is_last or (after and after[0]["walk"]["walks"])):
+    for one, after in pairwise(tested):
+        if one["walk"]["walks"] and after["walk"]["walks"]:
             return {key: value for key, value in _without_folder(one).items() if key != "walk"}
     return None
 
@@ -221,6 +246,8 @@ def main() -> int:
     config = gmijax.compose(*given.overrides)
     if robot_of(config.env) is None:
         raise ConfigError(f"env={config.env.label}: has no walking test")
+    if given.envs < LEAST_ENVS:
+        raise ConfigError(f"--envs={given.envs}: must be at least {LEAST_ENVS}")
     if not isinstance(config.num_envs, int):
         raise ConfigError(f"num_envs={config.num_envs}: must be a number here")
     with tempfile.TemporaryDirectory() as scratch:

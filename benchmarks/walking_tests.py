@@ -1,8 +1,9 @@
 """Tests checkpoints in a process of its own: `python -m benchmarks.walking_tests IN OUT`.
 
-IN is a JSON file: `env`, the task; `impl`, of the physics; `num_envs` and `seed` of the test;
-`runs`, lists of checkpoint folders, each the fewest steps first. OUT gets, after every test,
-`walks`, a list for each run: a `Walk` for each checkpoint, up to the second in a row that walks.
+IN is a JSON file: `env`, the task; `num_envs` and `seed` of the test; `runs`, lists of checkpoint
+folders, each the fewest steps first; `impls`, for each run what it asked for as physics. OUT gets,
+after every test, `walks`, a list for each run: a `Walk`, with `impl`, for each checkpoint, up to
+the second in a row that walks.
 """
 
 from __future__ import annotations
@@ -25,13 +26,23 @@ from gmijax.learning.walking import Act, WalkingTest, walking_env
 from gmijax.player.joystick import robot_of
 from gmijax.player.policy import read_policy
 from gmijax.runs.folder import POLICY, read_json, write_json
-from gmijax.sim.impl import choose_impl
+from gmijax.runs.resume import CheckpointMeta
+from gmijax.sim.impl import choose_impl, impl_of_policy
 from gmijax.sim.interface import Env
+from gmijax.sim.robots import changed_settings
+
+_WEIGHTS = ("kernels", "biases", "norms", "obs_mean", "obs_std")
+"""What of a policy of ours is given to its compiled test; all else is in the program."""
 
 
 class Policy(NamedTuple):
-    """What acts, and with which weights."""
+    """What acts, and with which weights.
 
+    Attributes:
+      kind: policies of one kind are tested by one program.
+    """
+
+    kind: tuple[Any, ...]
     act: Act
     weights: Any
 
@@ -43,19 +54,24 @@ def main() -> int:
     robot, num_envs = robot_of(config), asked["num_envs"]
     if robot is None:
         raise ConfigError(f"env={config.label}: has no walking test")
-    impl, _ = choose_impl(asked["impl"], jax.default_backend(), config.label)
-    env = walking_env(config, robot, impl, num_envs)
-    tests: dict[str, WalkingTest] = {}
+    envs: dict[str, Env] = {}
+    tests: dict[tuple[Any, ...], WalkingTest] = {}
     found: list[list[dict[str, Any]]] = [[] for _ in asked["runs"]]
-    for run, walks in zip(asked["runs"], found, strict=True):
+    for run, wanted, walks in zip(asked["runs"], asked["impls"], found, strict=True):
         for folder in map(Path, run):
-            kind, policy = policy_of(folder, env)
+            wished = impl_of_policy(wanted, _trained_with(folder))
+            impl, _ = choose_impl(wished, jax.default_backend(), config.label)
+            if impl not in envs:
+                envs[impl] = walking_env(config, robot, impl, num_envs)
+            policy = policy_of(folder, envs[impl])
+            kind = (impl, *policy.kind)
             if kind not in tests:
                 tests[kind] = WalkingTest(
-                    env, robot, policy.act, num_envs=num_envs, seed=asked["seed"]
+                    envs[impl], robot, policy.act, num_envs=num_envs, seed=asked["seed"]
                 )
                 tests[kind].compile(policy.weights)
-            walks.append(tests[kind].run(policy.weights).as_json())
+            walk = tests[kind].run(policy.weights)._replace(settings=changed_settings(config))
+            walks.append({**walk.as_json(), "impl": impl})
             write_json(out, {"walks": found})
             if walks_twice(walks):
                 break
@@ -67,18 +83,22 @@ def walks_twice(walks: Sequence[Mapping[str, Any]]) -> bool:
     return len(walks) > 1 and all(walk["walks"] for walk in walks[-2:])
 
 
-def policy_of(checkpoint: Path, env: Env) -> tuple[str, Policy]:
-    """Whose policy a checkpoint has, `gmijax` or `brax`, and the policy."""
-    if (checkpoint / POLICY).exists():
-        return "gmijax", _ours(checkpoint)
-    return "brax", _of_brax(checkpoint, env)
+def _trained_with(checkpoint: Path) -> str | None:
+    """The physics that a checkpoint of ours was trained with; None of one of Brax's."""
+    return CheckpointMeta.read(checkpoint).impl if (checkpoint / POLICY).exists() else None
+
+
+def policy_of(checkpoint: Path, env: Env) -> Policy:
+    """The policy of a checkpoint, ours or Brax's."""
+    return _ours(checkpoint) if (checkpoint / POLICY).exists() else _of_brax(checkpoint, env)
 
 
 def _ours(checkpoint: Path) -> Policy:
     policy = read_policy(checkpoint / POLICY)
-    names = ("kernels", "biases", "obs_mean", "obs_std")
-    weights = {name: jax.tree.map(jnp.asarray, getattr(policy, name)) for name in names}
-    return Policy(lambda given, obs: dataclasses.replace(policy, **given)(obs), weights)
+    weights = {name: jax.tree.map(jnp.asarray, getattr(policy, name)) for name in _WEIGHTS}
+    shapes = str(jax.tree.map(jnp.shape, weights))  # Of one with layer norm, that of its norms.
+    kind = ("gmijax", policy.head, policy.obs_clip, policy.action_size, shapes)
+    return Policy(kind, lambda given, obs: dataclasses.replace(policy, **given)(obs), weights)
 
 
 def _of_brax(checkpoint: Path, env: Env) -> Policy:
@@ -92,7 +112,7 @@ def _of_brax(checkpoint: Path, env: Env) -> Policy:
         named = {"state": obs[:, :seen], "privileged_state": obs[:, seen:]}
         return make_policy(weights, deterministic=True)(named, jax.random.key(0))[0]
 
-    return Policy(act, jax.tree.map(jnp.asarray, saved.load(checkpoint)))
+    return Policy(("brax",), act, jax.tree.map(jnp.asarray, saved.load(checkpoint)))
 
 
 def _network(config: Mapping[str, Any]) -> Any:

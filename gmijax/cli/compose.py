@@ -24,6 +24,7 @@ from gmijax.config.schema import flatten, from_dict, known, require_between, sug
 from gmijax.errors import ConfigError
 from gmijax.runs.saved_config import require_known_keys, saved_config_of
 from gmijax.sim.registry import SUITES
+from gmijax.sim.robots import robot_name
 from gmijax.sim.source import reference
 
 C = TypeVar("C")
@@ -150,6 +151,7 @@ def compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     for item in items:
         _check_override(name, item)
     chosen = {item.key_or_group: str(item.value()) for item in items}
+    _check_terms(name, items, chosen)
     if chosen.get("env") in ("custom", "playground"):
         overrides = [f"++{text}" if text.startswith(NAMED_BY_TASK) else text for text in overrides]
     try:
@@ -189,6 +191,19 @@ def _check_override(name: str, item: Override) -> None:
         raise ConfigError(
             f"{key}={item.value()}: unknown{few or suggestion(str(item.value()), options)}"
         )
+
+
+def _check_terms(name: str, items: Sequence[Override], chosen: Mapping[str, str]) -> None:
+    """Refuses terms of the reward that a robot does not have; `+` would add any."""
+    of_playground = chosen.get("env") == "playground"
+    robot = robot_name(chosen.get("env.name" if of_playground else "env", ""))
+    terms = [item.key_or_group for item in items if item.key_or_group.startswith("env.rewards.")]
+    if robot is None or not terms:
+        return
+    keys = defaults(name, [f"env={robot}"])
+    for term in terms:
+        if term not in keys:
+            raise _unknown_key(term, keys)
 
 
 def _check_task_key(items: Sequence[Override]) -> None:

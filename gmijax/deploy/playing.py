@@ -35,7 +35,7 @@ from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
 from gmijax.player.joystick import robot_of
-from gmijax.player.walking import lines_of
+from gmijax.player.walking import ONE_ACTION, lines_of
 from gmijax.runs.folder import (
     META,
     PlayPaths,
@@ -133,6 +133,9 @@ def _walking(config: PlayConfig, walk: Mapping[str, Any] | None) -> str:
         return "\n".join(lines_of(walk))
     if config.walking_envs == 0:
         return "no walking test: walking_envs=0"
+    repeat = trained_config(Path(str(config.checkpoint)))[0].action_repeat
+    if repeat != 1:
+        return f"no walking test: env.action_repeat={repeat}; {ONE_ACTION}"
     return "no walking test without a GPU, unless it is asked for: walking_envs=8 takes minutes"
 
 
@@ -169,12 +172,16 @@ def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
     """As `open_run`, with what only playing asks for checked too."""
     config, env, changed = open_run(config)
     if config.randomize == "on" and not draws_models(env):
-        raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
-    if config.walking_envs and robot_of(env) is None:
-        raise ConfigError(
-            f"walking_envs={config.walking_envs}: {env.label} has no walking test; "
-            "allowed are 0, null"
-        )
+        why = "env.randomization of the run names nothing to draw"
+        if env.suite == "playground":
+            why = f"Playground has no randomisation for {env.label}; allowed is off"
+        raise ConfigError(f"randomize=on: {why}")
+    if config.walking_envs:
+        asked = f"walking_envs={config.walking_envs}"
+        if robot_of(env) is None:
+            raise ConfigError(f"{asked}: {env.label} has no walking test; allowed are 0, null")
+        if env.action_repeat != 1:
+            raise ConfigError(f"{asked}: env.action_repeat={env.action_repeat}; {ONE_ACTION}")
     return config, changed
 
 

@@ -18,10 +18,11 @@ import numpy as np
 
 from gmijax.compile_once import compile_once
 from gmijax.config import EnvConfig
+from gmijax.errors import ConfigError
 from gmijax.learning.learner import Learner, acting_weights
 from gmijax.learning.normalize import normalize
 from gmijax.player.joystick import Ground, Readings, Robot, with_pushes
-from gmijax.player.walking import LENGTH_S, Recording, Walk, measure
+from gmijax.player.walking import LENGTH_S, ONE_ACTION, Recording, Walk, measure
 from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.randomize import make_worlds
 from gmijax.sim.wrappers import env_keys, select_worlds, vectorise
@@ -95,7 +96,13 @@ class WalkingTest:
 
 
 def walking_env(config: EnvConfig, robot: Robot, impl: str, num_envs: int) -> Env:
-    """The environments of the test of a task: as trained, with pushes, and all with one model."""
+    """The environments of the test of a task: as trained, with pushes, and all with one model.
+
+    Raises:
+      ConfigError: it repeats actions, or cannot be had.
+    """
+    if config.action_repeat != 1:  # Pushes and commands in between would not be seen.
+        raise ConfigError(f"env.action_repeat={config.action_repeat}: {ONE_ACTION}")
     tested = dataclasses.replace(with_pushes(config, robot), randomize="off", curriculum="off")
     return make_worlds(tested, impl, seed=0, first_env=FIRST_ENV, num_envs=num_envs)
 

@@ -25,7 +25,10 @@ _PARTS: Final[Mapping[str, tuple[str, str]]] = {
     "up_axis": ("1", "z axis of the IMU in the frame of the world: (0, 0, 1) upright"),
     "joint_pos": ("rad", "positions of the joints minus the default pose"),
     "joint_vel": ("rad/s", "velocities of the joints"),
-    "joint_errors": ("rad", "positions minus targets of the last three steps, the newest first"),
+    "joint_errors": (
+        "rad",
+        "positions, as they are in joint_pos, minus targets of the last three steps, newest first",
+    ),
     "feet_pos": ("m", "positions of the feet FL, FR, HL, HR in the frame of the IMU"),
     "last_action": ("1", "the action, as the policy gave it"),
     "command": ("m/s, m/s, rad/s", "velocity forwards, to the left, and turn to the left"),
@@ -43,14 +46,14 @@ def deployment_of(robot: Robot, model: Any, config: Mapping[str, Any]) -> dict[s
       config: Playground's configuration of the task.
     """
     joints = model.actuator_trnid[:, 0]
-    dofs, places = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
+    dofs, positions = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
     limits = Readings(model, robot).torque_limit_n_m
     scale = float(config["action_scale"])
     return {
         "name": robot.name,
         "obs": _layout(robot, len(joints), config),
         "joint_names": [model.joint(int(joint)).name for joint in joints],
-        "default_pose_rad": model.key(robot.keyframe).qpos[places].tolist(),
+        "default_pose_rad": model.key(robot.keyframe).qpos[positions].tolist(),
         "kp_n_m_per_rad": model.actuator_gainprm[:, 0].tolist(),
         # Playground has some of it in the motors and some in the joints.
         "kd_n_m_s_per_rad": (model.dof_damping[dofs] - model.actuator_biasprm[:, 2]).tolist(),
@@ -59,6 +62,7 @@ def deployment_of(robot: Robot, model: Any, config: Mapping[str, Any]) -> dict[s
         "target_range_rad": model.actuator_ctrlrange.tolist(),
         "control_dt_s": float(config["ctrl_dt"]),
         "physics_dt_s": float(config["sim_dt"]),
+        "ccd_iterations": int(model.opt.ccd_iterations),
         "phase": _phase(robot),
         "commands": _commands(robot, config),
         "pushes": _pushes(robot, config),
@@ -80,7 +84,6 @@ def _layout(robot: Robot, num_joints: int, config: Mapping[str, Any]) -> list[di
                 "name": name,
                 "start": start,
                 "length": length,
-                "scale": 1.0,
                 "noise": amplitude,
                 "delay_steps": int(name in LATE),
                 "unit": unit,
@@ -97,7 +100,7 @@ def _phase(robot: Robot) -> dict[str, Any] | None:
     return {
         "hz": list(robot.gait_hz),
         "start_rad": [0.0, np.pi],
-        "holds_at_zero_command": robot.holds_phase,
+        "zero_command_phase_rad": robot.zero_command_phase_rad,
     }
 
 
@@ -113,14 +116,17 @@ def _commands(robot: Robot, config: Mapping[str, Any]) -> dict[str, Any]:
 
 def _pushes(robot: Robot, config: Mapping[str, Any]) -> dict[str, Any]:
     drawn = config[robot.pushes]
+    enabled = {"enabled": bool(drawn["enable"])}
     if robot.pushes == "push_config":
         return {
+            **enabled,
             "change_m_per_s": list(drawn["magnitude_range"]),
             "every_s": list(drawn["interval_range"]),
         }
     return {
+        **enabled,
         "body": robot.body,
-        "impulse_m_per_s": list(drawn["velocity_kick"]),
+        "velocity_kick_m_per_s": list(drawn["velocity_kick"]),
         "duration_s": list(drawn["kick_durations"]),
         "wait_s": list(drawn["kick_wait_times"]),
     }

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from gmijax.config import EnvConfig
 from gmijax.config.env import ROBOTS as NAMES
+from gmijax.sim.robots import robot_name
 
 Floats = npt.NDArray[np.float32]
 
@@ -40,7 +41,8 @@ class Robot(NamedTuple):
       body: that is pushed by forces.
       redrawn_steps: control steps after which a new command is drawn; None: at random times.
       gait_hz: range of the frequency of the gait's clock; None: the robot has none.
-      holds_phase: whether that clock stands still while the command is zero.
+      zero_command_phase_rad: what the two legs' phases are set to while the command is zero; they
+        go on from there. None: the clock goes on as ever.
       up_sensor: z axis of a part of the body, by which the task says that the robot has fallen:
       least_up: if its z is less than this.
       touch_sensors: contacts by which it says so too.
@@ -55,7 +57,7 @@ class Robot(NamedTuple):
     body: str
     redrawn_steps: int | None
     gait_hz: tuple[float, float] | None = None
-    holds_phase: bool = False
+    zero_command_phase_rad: tuple[float, float] | None = None
     up_sensor: str = "upvector"
     least_up: float = 0.0
     touch_sensors: tuple[str, ...] = ()
@@ -79,7 +81,7 @@ ROBOTS: Final[Mapping[str, Robot]] = MappingProxyType(
         "t1": Robot(
             *("t1", "home", 0.665, "", _HUMANOID, "push_config", "Trunk", 501),
             gait_hz=(1.25, 1.75),
-            holds_phase=True,
+            zero_command_phase_rad=(np.pi, np.pi),
         ),
         "spot": Robot(
             *("spot", "home", 0.46, "", _SPOT, "pert_config", "body", 201),
@@ -94,9 +96,8 @@ def robot_of(env: EnvConfig) -> Robot | None:
     """The robot of one of Playground's joystick tasks, None of another task."""
     if env.suite != "playground":
         return None
-    names = {theirs: name for name, theirs in NAMES.items()}
-    name = names.get(str(env.name), str(env.name))
-    return ROBOTS.get(name.removesuffix("_rough"))
+    name = robot_name(str(env.name))
+    return None if name is None else ROBOTS[name.removesuffix("_rough")]
 
 
 def with_pushes(env: EnvConfig, robot: Robot) -> EnvConfig:

@@ -87,7 +87,7 @@ class Forces:
         self._wait = round(rng.uniform(*about["wait_s"]) / self._dt_s)
         self._duration_s = rng.uniform(*about["duration_s"])
         self._steps = round(self._duration_s / self._dt_s)
-        self._size = rng.uniform(*about["impulse_m_per_s"])
+        self._size = rng.uniform(*about["velocity_kick_m_per_s"])
         self._since = self._pushed = 0
         self._direction = np.zeros(2)
 

@@ -22,11 +22,12 @@ Floats = npt.NDArray[np.float32]
 
 
 class _Memory(NamedTuple):
-    """What an observation knows of the steps before."""
+    """What an observation knows of the steps before, and the joints' positions as measured."""
 
     last_action: npt.NDArray[Any]
     command: npt.NDArray[Any]
     phase: npt.NDArray[Any]
+    measured: npt.NDArray[Any]
     joint_errors: npt.NDArray[Any]
 
 
@@ -66,7 +67,7 @@ class JoystickEnv:
         self._about, self._rng = about, rng
         self._pose = np.array(about["default_pose_rad"])
         self._low, self._high = np.array(about["target_range_rad"]).T
-        _set_gains(model, about)
+        _set_up(model, about)
         # A start over would hide bad numbers, which are a fall.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.data = mujoco.MjData(model)
@@ -75,8 +76,17 @@ class JoystickEnv:
         self._substeps = round(self.control_dt_s / about["physics_dt_s"])
         self._pusher = pusher_of(about, model, rng) if pushes else None
         self._commands = Commands(about, rng)
-        amplitudes = [np.resize(part["noise"], part["length"]) for part in about["obs"]]
-        self._noise = noise * np.concatenate(amplitudes)
+        amplitudes = {
+            part["name"]: noise * np.resize(part["noise"], part["length"]) for part in about["obs"]
+        }
+        # Measured once in a step: the errors of later ones are of the same numbers.
+        self._joint_noise = amplitudes["joint_pos"]
+        amplitudes |= {
+            name: np.zeros_like(amplitudes[name])
+            for name in ("joint_pos", "joint_errors")
+            if name in amplitudes
+        }
+        self._noise = np.concatenate(list(amplitudes.values()))
         self.reset()
 
     @property
@@ -104,16 +114,18 @@ class JoystickEnv:
         data.ctrl[:] = data.qpos[7:]
         mujoco.mj_forward(model, data)
         num_joints = len(self._pose)
-        self.gait_hz = 0.0 if self.robot.gait_hz is None else rng.uniform(*self.robot.gait_hz)
+        phase = self._about["phase"]
+        self.gait_hz = 0.0 if phase is None else rng.uniform(*phase["hz"])
         if self._pusher is not None:
             self._pusher.begin()
         self._memory = _Memory(
             last_action=np.zeros(num_joints),
             command=self._commands.begin(),
-            phase=np.array([0.0, np.pi]),
+            phase=np.zeros(2) if phase is None else np.array(phase["start_rad"]),
+            measured=np.zeros(num_joints),
             joint_errors=np.zeros(3 * num_joints),
         )
-        self._note_errors(np.zeros(num_joints))
+        self._measure_joints(np.zeros(num_joints))
         return self.observe()
 
     def step(self, action: npt.ArrayLike) -> tuple[Floats, Recording]:
@@ -128,24 +140,24 @@ class JoystickEnv:
         targets = np.clip(targets, self._low, self._high)  # As the motors of the model do.
         self.data.ctrl[:] = targets
         mujoco.mj_step(self.model, self.data, self._substeps)
-        self._note_errors(targets)
-        obs, told = self.observe(), self._memory.command
+        self._measure_joints(targets)
+        obs, command = self.observe(), self._memory.command
         # Only now, as Playground does it: see `gmijax.player.deployment.LATE`.
-        new = self._commands.next(told)
+        new = self._commands.next(command)
         self._memory = self._memory._replace(
-            last_action=action, command=new, phase=self._next_phase(told)
+            last_action=action, command=new, phase=self._next_phase(command)
         )
-        return obs, self._recorded(told, is_pushed or not np.array_equal(told, new))
+        return obs, self._recorded(command, is_pushed or not np.array_equal(command, new))
 
     def observe(self) -> Floats:
-        """The observation [O] by now; its noise is drawn anew each time."""
+        """The observation [O] by now. Its noise is drawn anew each time, but for the joints'."""
         data, memory = self.data, self._memory
         axes = data.site_xmat[self._imu].reshape(3, 3)
         suffix = self.robot.suffix
         parts = {
             "gravity": -axes[2],
             "up_axis": axes[:, 2],
-            "joint_pos": data.qpos[7:] - self._pose,
+            "joint_pos": memory.measured - self._pose,
             "joint_vel": data.qvel[6:],
             **memory._asdict(),
             "phase": np.concatenate([np.cos(memory.phase), np.sin(memory.phase)]),
@@ -159,14 +171,18 @@ class JoystickEnv:
         noise = self._noise * self._rng.uniform(-1, 1, len(obs))
         return (obs + noise).astype(np.float32)
 
-    def _note_errors(self, targets: npt.NDArray[Any]) -> None:
+    def _measure_joints(self, targets: npt.NDArray[Any]) -> None:
+        measured = self.data.qpos[7:] + self._joint_noise * self._rng.uniform(-1, 1, len(targets))
         errors = np.roll(self._memory.joint_errors, len(targets))
-        errors[: len(targets)] = self.data.qpos[7:] - targets
-        self._memory = self._memory._replace(joint_errors=errors)
+        errors[: len(targets)] = measured - targets
+        self._memory = self._memory._replace(measured=measured, joint_errors=errors)
 
     def _next_phase(self, command: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        if self.robot.holds_phase and np.linalg.norm(command) <= 0.01:
-            return np.full(2, np.pi)
+        about = self._about["phase"]
+        if about is None:
+            return self._memory.phase
+        if np.linalg.norm(command) <= 0.01 and about["zero_command_phase_rad"] is not None:
+            return np.array(about["zero_command_phase_rad"])
         phase = self._memory.phase + 2 * np.pi * self.control_dt_s * self.gait_hz
         return np.fmod(phase + np.pi, 2 * np.pi) - np.pi
 
@@ -192,10 +208,11 @@ def _alone(value: npt.ArrayLike) -> npt.NDArray[Any]:
 _FEET: Final = ["FL_pos", "FR_pos", "HL_pos", "HR_pos"]
 
 
-def _set_gains(model: Any, about: Mapping[str, Any]) -> None:
-    """The PD control of the metadata, in place of what the file of the model has."""
+def _set_up(model: Any, about: Mapping[str, Any]) -> None:
+    """Gains and physics of the metadata, in lieu of what the file of the model has."""
     kp, kd = np.array(about["kp_n_m_per_rad"]), np.array(about["kd_n_m_s_per_rad"])
     dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
     model.opt.timestep = about["physics_dt_s"]
+    model.opt.ccd_iterations = about["ccd_iterations"]
     model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1] = kp, -kp
     model.dof_damping[dofs] = kd + model.actuator_biasprm[:, 2]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
 from typing import Any, Literal
 
 import mujoco
@@ -11,7 +9,7 @@ import mujoco
 from gmijax.config.env import ROBOTS as NAMES
 from gmijax.errors import ConfigError
 from gmijax.player.joystick import Robot
-from gmijax.sim.robot_models import model_folder, models_of
+from gmijax.sim.robot_models import model_folder, models_of, playground_folder
 
 
 def joystick_model(robot: Robot, terrain: Literal["flat", "rough"]) -> Any:
@@ -20,18 +18,19 @@ def joystick_model(robot: Robot, terrain: Literal["flat", "rough"]) -> Any:
     Raises:
       ConfigError: Playground or the robot's meshes are not installed, or no such terrain.
     """
-    spec = importlib.util.find_spec("mujoco_playground")
-    if spec is None or spec.origin is None:
-        raise ConfigError("the models need the package playground (pip install playground)")
-    xmls = Path(spec.origin).parent / "_src" / "locomotion" / robot.name / "xmls"
+    if (package := playground_folder()) is None:
+        raise ConfigError(
+            "the models need the package mujoco_playground (pip install 'gmijax[playground]')"
+        )
+    xmls = package / "_src" / "locomotion" / robot.name / "xmls"
     if terrain == "rough" and f"{robot.name}_rough" not in NAMES:
         raise ConfigError(f"terrain=rough: {robot.name} has none; allowed is flat")
     scene = xmls / f"scene_mjx_feetonly_{terrain}_terrain.xml"
     folder = model_folder(*models_of(NAMES[robot.name]))
     files = [
         path
-        for place, pattern in ((xmls, "*.xml"), (xmls / "assets", "*"), (folder, "*.xml"))
-        for path in place.glob(pattern)
+        for parent, pattern in ((xmls, "*.xml"), (xmls / "assets", "*"), (folder, "*.xml"))
+        for path in parent.glob(pattern)
     ]
     files += (folder / "assets").glob("*")
     assets = {path.name: path.read_bytes() for path in files if path.is_file()}

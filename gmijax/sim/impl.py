@@ -46,6 +46,11 @@ here runs in JAX.
 _GIVEN = "set on the command line or by the run"
 
 
+def impl_of_policy(wanted: str, trained_with: str | None) -> str:
+    """What to ask for where a policy is played: it may depend on what it was trained with."""
+    return "jax" if wanted == "auto" and trained_with == "jax" else wanted
+
+
 def choose_impl(
     impl: str,
     device_platform: str,

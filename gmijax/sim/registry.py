@@ -16,8 +16,8 @@ from gmijax.config.env import ROBOTS, choice_of
 from gmijax.errors import ConfigError
 from gmijax.machine.xla_on_cpu import missing_on_cpu
 from gmijax.sim import source
-from gmijax.sim.robot_models import require_models
-from gmijax.sim.robots import ROBOT_SETTINGS, has_randomizer, playground_name
+from gmijax.sim.robot_models import has_randomizer, require_models
+from gmijax.sim.robots import ROBOT_SETTINGS, playground_name
 from gmijax.sim.tasks.settings import CURRICULA, SETTINGS, settings_from
 
 if TYPE_CHECKING:

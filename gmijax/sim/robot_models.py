@@ -12,37 +12,54 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
 from gmijax.errors import ConfigError
 
 PACKAGE: Final = "mujoco_menagerie"
 
-_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+
+class _Robot(NamedTuple):
+    """What Playground's tasks with a robot need, and whether it draws models for them."""
+
+    models: tuple[str, ...] = ()
+    has_randomizer: bool = False
+
+
+_ROBOTS: Mapping[str, _Robot] = MappingProxyType(
     {
-        "Aero": ("tetheria_aero_hand_open",),
-        "Aloha": ("aloha",),
-        "Apollo": ("apptronik_apollo",),
-        "Barkour": ("google_barkour_vb",),
-        "Berkeley": ("berkeley_humanoid",),
-        "G1": ("unitree_g1",),
-        "Go1": ("unitree_go1",),
-        "H1": ("unitree_h1",),
-        "Leap": ("leap_hand",),
-        "Op3": ("robotis_op3",),
-        "Panda": ("franka_emika_panda",),
-        "PandaRobotiq": ("franka_emika_panda", "robotiq_2f85_v4"),
-        "Spot": ("boston_dynamics_spot",),
-        "T1": ("booster_t1",),
+        "Aero": _Robot(("tetheria_aero_hand_open",), has_randomizer=True),
+        "Aloha": _Robot(("aloha",)),
+        "Apollo": _Robot(("apptronik_apollo",)),
+        "Barkour": _Robot(("google_barkour_vb",)),
+        "Berkeley": _Robot(("berkeley_humanoid",), has_randomizer=True),
+        "G1": _Robot(("unitree_g1",), has_randomizer=True),
+        "Go1": _Robot(("unitree_go1",), has_randomizer=True),
+        "H1": _Robot(("unitree_h1",)),
+        "Leap": _Robot(("leap_hand",), has_randomizer=True),
+        "Op3": _Robot(("robotis_op3",)),
+        "Panda": _Robot(("franka_emika_panda",)),
+        "PandaRobotiq": _Robot(("franka_emika_panda", "robotiq_2f85_v4")),
+        "Spot": _Robot(("boston_dynamics_spot",)),
+        "T1": _Robot(("booster_t1",), has_randomizer=True),
     }
 )
-"""How names of Playground's tasks begin -> the models that they need; all others need none."""
+"""How names of Playground's tasks begin -> the robot; all others need no models."""
+
+
+def _robot(task: str) -> _Robot:
+    begins = [prefix for prefix in _ROBOTS if task.startswith(prefix)]
+    return _ROBOTS[max(begins, key=len)] if begins else _Robot()
+
+
+def has_randomizer(task: str) -> bool:
+    """Whether Playground brings domain randomisation for a task, by its name there."""
+    return _robot(task).has_randomizer
 
 
 def models_of(task: str) -> tuple[str, ...]:
     """The models that a task of Playground needs, by its name there."""
-    begins = [prefix for prefix in _MODELS if task.startswith(prefix)]
-    return _MODELS[max(begins, key=len)] if begins else ()
+    return _robot(task).models
 
 
 def require_models(task: str, label: str) -> None:
@@ -83,10 +100,14 @@ def _whole(folder: Path) -> Path | None:
 
 def _clone() -> Path | None:
     """Where Playground itself clones all models to, if one has used it without gmijax."""
+    package = playground_folder()
+    return None if package is None else package / "external_deps" / "mujoco_menagerie"
+
+
+def playground_folder() -> Path | None:
+    """The folder of the package `mujoco_playground`, None if it is not installed."""
     spec = importlib.util.find_spec("mujoco_playground")
-    if spec is None or spec.origin is None:
-        return None
-    return Path(spec.origin).parent / "external_deps" / "mujoco_menagerie"
+    return None if spec is None or spec.origin is None else Path(spec.origin).parent
 
 
 def how_to_get(names: Sequence[str]) -> str:

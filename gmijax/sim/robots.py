@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
+from gmijax.config import EnvConfig
 from gmijax.config.env import ROBOTS
 from gmijax.config.schema import doc
 from gmijax.errors import ConfigError
@@ -20,7 +21,7 @@ from gmijax.sim.tasks.settings import TaskSettings
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSettings(TaskSettings):
-    """What all robots share."""
+    """What all robots share. Pushes are forces of a moment, but for humanoids."""
 
     action_scale_rad: float = doc(
         "way of a joint's target from the default pose at full action, rad",
@@ -30,10 +31,14 @@ class RobotSettings(TaskSettings):
     noise: float = doc("factor of the noise in observations; 0: none", default=1.0, low=0)
     push: float = doc("1: the robot is pushed now and then; 0: never", default=0.0)
     push_min_m_per_s: float = doc(
-        "pushes: least change of the trunk's velocity, m/s", default=0.0, low=0
+        "pushes: least force; it changes the trunk's velocity by 1/pi of this, m/s",
+        default=0.0,
+        low=0,
     )
     push_max_m_per_s: float = doc(
-        "pushes: largest change of the trunk's velocity, m/s", default=3.0, low=0
+        "pushes: largest force; it changes the trunk's velocity by 1/pi of this, m/s",
+        default=3.0,
+        low=0,
     )
 
     def __post_init__(self) -> None:
@@ -208,6 +213,16 @@ def playground_name(name: str) -> str:
     return ROBOTS.get(name, name)
 
 
-def has_randomizer(task: str) -> bool:
-    """Whether Playground brings domain randomisation for a task, by its name there."""
-    return task.startswith(("Aero", "Berkeley", "G1", "Go1", "Leap", "T1"))
+def robot_name(name: str) -> str | None:
+    """The name in `ROBOTS` of a task, given that or Playground's; None of another task."""
+    return next((ours for ours, theirs in ROBOTS.items() if name in (ours, theirs)), None)
+
+
+def changed_settings(env: EnvConfig) -> dict[str, float]:
+    """A robot's settings that are not the task's own, whether there are pushes left out."""
+    defaults = vars(ROBOT_SETTINGS[str(env.name)]()) if env.name in ROBOT_SETTINGS else {}
+    return {
+        name: value
+        for name, value in env.settings.items()
+        if value != defaults.get(name) and name != "push" and not name.endswith(".enable")
+    }

@@ -13,6 +13,7 @@ from gmijax.player.deployment import deployment_of
 from gmijax.player.joystick import part_sizes, robot_of
 from gmijax.runs.folder import ExportPaths, read_json, write_bytes, write_json
 from gmijax.runs.saved_config import trained_config
+from gmijax.sim.robots import changed_settings
 from gmijax.supervise.child import ChildLink, run_gmi
 
 if TYPE_CHECKING:
@@ -78,7 +79,12 @@ def _robot(config: EnvConfig, env: Env, obs_size: int) -> dict[str, Any]:
     task = deployment_of(robot, env.mj_model, configuration(str(config.name), config.settings))
     return {
         "obs_terms": list(map(list, parts)) * config.history,
-        "robot": {**task, "history": config.history, "action_repeat": config.action_repeat},
+        "robot": {
+            **task,
+            "history": config.history,
+            "action_repeat": config.action_repeat,
+            "settings": changed_settings(config),
+        },
     }
 
 

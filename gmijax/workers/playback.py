@@ -72,11 +72,13 @@ def _run(link: ChildLink) -> None:
         "device": f"{device.platform}: {device.device_kind}",
         "camera": camera,
     }
+    outcome = summarise(config, env.spec.name, env_steps, episodes)
+    # After the trajectory: whoever sees it finds that complete. Before the walking test, which
+    # may fail.
+    write_json(paths.returns, {**outcome, **about})
     if (robot := robot_of(env_config)) is not None:
         about["walking"] = _walk(config, env_config, robot, impl, link, learner, state)
-    # Written last: whoever sees it finds the trajectory complete.
-    outcome = summarise(config, env.spec.name, env_steps, episodes)
-    write_json(paths.returns, {**outcome, **about})
+        write_json(paths.returns, {**outcome, **about})
 
 
 def _walk(
@@ -94,27 +96,26 @@ def _walk(
     num_envs = config.walking_envs
     if num_envs is None:
         num_envs = 0 if jax.default_backend() == "cpu" else NUM_ENVS
-    if num_envs == 0:
+    if num_envs == 0 or env_config.action_repeat != 1:
         return None
     from gmijax.learning.walking import WalkingTest, act_of, walking_env
+    from gmijax.sim.robots import changed_settings
 
     link.beat("compiling", 0)
     env = walking_env(env_config, robot, impl, num_envs)
     test = WalkingTest(env, robot, act_of(learner), num_envs=num_envs, seed=config.seed)
     test.compile(state)
-    return test.run(state, lambda chunks: link.beat("running", chunks)).as_json()
+    walk = test.run(state, lambda chunks: link.beat("running", chunks))
+    return walk._replace(settings=changed_settings(env_config)).as_json()
 
 
 def _impl(config: PlayConfig, checkpoint: Path, env_config: EnvConfig) -> str:
     """The MJX to play with; says why."""
     import jax
 
-    from gmijax.sim.impl import choose_impl
+    from gmijax.sim.impl import choose_impl, impl_of_policy
 
-    wanted = config.physics.impl
-    if wanted == "auto" and CheckpointMeta.read(checkpoint).impl == "jax":
-        # A policy may depend on what it was trained with.
-        wanted = "jax"
+    wanted = impl_of_policy(config.physics.impl, CheckpointMeta.read(checkpoint).impl)
     impl, why = choose_impl(wanted, jax.default_backend(), env_config.label)
     sys.stdout.write(f"physics.impl={impl}: {why}\n")
     return impl

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,15 +21,15 @@ from gmijax.config.schema import flatten
 from gmijax.deploy.files import stablehlo_content
 from gmijax.deploy.trained import trained_policy
 from gmijax.errors import ConfigError
-from gmijax.learning.walking import recorded
+from gmijax.learning.walking import recorded, walking_env
 from gmijax.player.joystick import ROBOTS as WALKERS
 from gmijax.player.joystick import Ground, Readings
 from gmijax.player.walking import Recording, measure
 from gmijax.sim.interface import Env
 from gmijax.sim.randomize import make_worlds, randomized
 from gmijax.sim.registry import make_env, require_env
-from gmijax.sim.robot_models import models_of
-from gmijax.sim.robots import ROBOT_SETTINGS, has_randomizer
+from gmijax.sim.robot_models import has_randomizer, models_of
+from gmijax.sim.robots import ROBOT_SETTINGS
 from gmijax.sim.wrappers import BatchState, StepOutput, training_env
 from gmijax.workers.exporter import names_of
 
@@ -44,6 +44,7 @@ class Walked(NamedTuple):
     """Go1, randomised, in worlds that have all started alike, and its first steps."""
 
     env: Env
+    step: Callable[..., tuple[BatchState, StepOutput]]
     states: list[BatchState]
     output: StepOutput
 
@@ -72,7 +73,7 @@ def walked(models: None) -> Walked:
     for _ in range(5):
         state, output = step(env.model, states[-1], actions)
         states.append(state)
-    return Walked(env, states, output)
+    return Walked(env, step, states, output)
 
 
 def test_go1_starts_and_steps(walked: Walked) -> None:
@@ -139,9 +140,44 @@ def test_the_walking_test_reads_what_playground_rewards(walked: Walked) -> None:
     effort = np.abs(obs[..., 135:147]) / readings.torque_limit_n_m
     np.testing.assert_allclose(steps.load, effort, atol=1e-4)
     walk = measure(steps, robot, Ground(walked.env.mj_model), walked.env.spec.control_dt_s)
-    assert (walk.num_envs, walk.upright, walk.walks) == (NUM_ENVS, 1.0, False)
+    assert (walk.num_envs, walk.upright, walk.walks) == (NUM_ENVS, 1.0, None)
     assert walk.all_steps.linear_m_per_s is not None
     assert walk.settled.linear_m_per_s is None
+
+
+def test_the_walking_test_sees_playgrounds_pushes(walked: Walked) -> None:
+    readings = Readings(walked.env.mj_model, WALKERS["go1"])
+    trunk = walked.env.mj_model.body("trunk").id
+    before = walked.states[-1]
+    pushed, disturbed, redrawn = [], [], []
+    for _ in range(160):  # The first push comes after 1 to 3 s.
+        actions = jnp.zeros((NUM_ENVS, walked.env.spec.action_size))
+        after, _ = walked.step(walked.env.model, before, actions)
+        forces = np.asarray(after.env.physics.data.xfrc_applied)
+        assert not np.delete(forces, trunk, 1).any()
+        pushed.append(forces[:, trunk].any(-1))
+        disturbed.append(np.asarray(recorded(readings, before.env, after.env).disturbed))
+        commands = [np.asarray(state.env.task.info["command"]) for state in (before, after)]
+        redrawn.append((commands[0] != commands[1]).any(-1))
+        before = after
+    assert np.any(pushed, axis=0).all(), "every robot is pushed"
+    np.testing.assert_array_equal(disturbed, np.logical_or(pushed, redrawn))
+
+
+def test_the_walking_test_asks_for_pushes(monkeypatch: pytest.MonkeyPatch, models: None) -> None:
+    configured: dict[str, Any] = {}
+
+    def load(task: str, config_overrides: dict[str, Any]) -> None:
+        configured.update(config_overrides)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(playground.registry, "load", load)
+    for name, key in (("go1", "pert_config.enable"), ("g1", "push_config.enable")):
+        task = gmijax.compose(f"env={name}", "env.settings.push=0", "env.settings.noise=0.5").env
+        with pytest.raises(ConfigError, match="enough"):
+            walking_env(task, WALKERS[name], "jax", NUM_ENVS)
+        assert configured[key] is True
+        assert configured["noise_config.level"] == 0.5
 
 
 def test_a_policy_for_go1_is_exported(walked: Walked, tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from benchmarks.walking import _theirs, summary, walks_from
 from benchmarks.walking_tests import Policy, policy_of, walks_twice
 from gmijax.config import EnvConfig
 from gmijax.config.schema import to_dict
+from gmijax.errors import ConfigError
 from gmijax.player.policy import PlainPolicy, write_policy
 from gmijax.runs.folder import POLICY, RunPaths, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta
@@ -40,17 +41,27 @@ def checkpoints(*walks: bool | None) -> list[dict[str, Any]]:
 
 
 def test_a_training_walks_from_the_first_of_two_checkpoints_in_a_row():
-    found = walks_from(checkpoints(False, True, False, True, True, None), is_complete=True)
+    found = walks_from(checkpoints(False, True, False, True, True, None))
     assert found == {"env_steps": 40, "command_s": 8.0, "training_s": 4.0}
 
 
-def test_the_last_checkpoint_is_enough_if_nothing_was_left_out():
-    found = walks_from(checkpoints(False, True), is_complete=True)
-    assert found is not None
-    assert found["env_steps"] == 20
-    assert walks_from(checkpoints(False, True), is_complete=False) is None
-    assert walks_from(checkpoints(False, True, None), is_complete=True) is None
-    assert walks_from([], is_complete=True) is None
+def test_a_single_checkpoint_that_walks_is_not_enough():
+    assert walks_from(checkpoints(False, True)) is None
+    assert walks_from(checkpoints(False, True, None)) is None
+    assert walks_from(checkpoints(True, False, True)) is None
+    assert walks_from([]) is None
+
+
+def test_of_too_few_environments_nothing_is_said():
+    assert walks_from([{"walk": {"walks": None}}] * 3) is None
+
+
+def test_a_folder_of_trainings_is_not_used_twice(tmp_path, monkeypatch):
+    (tmp_path / "gmijax-compile").mkdir()
+    overrides = ("env=go1", "num_envs=64", f"--runs={tmp_path}", f"--out={tmp_path}")
+    monkeypatch.setattr("sys.argv", ["walking", *overrides])
+    with pytest.raises(ConfigError, match=f"^--runs={tmp_path}: has a gmijax-compile already$"):
+        walking.main()
 
 
 def test_tests_end_with_the_second_in_a_row_that_walks():
@@ -60,8 +71,8 @@ def test_tests_end_with_the_second_in_a_row_that_walks():
 
 def test_summary_has_least_median_and_most_of_those_that_walk():
     runs = [
-        {"trainer": "gmijax", "walks_from": walks_from(checkpoints(*walks), is_complete=True)}
-        for walks in ((True, True), (False, True, True), (False, False), (True, True))
+        {"trainer": "gmijax", "walks_from": walks_from(checkpoints(*walks))}
+        for walks in ((True, True), (False, True, True), (False, True), (True, True))
     ]
     row = summary([*runs, {"trainer": "train-jax-ppo"}])
     assert row["gmijax"] == {
@@ -90,20 +101,47 @@ class Sized:
         actor_obs_size = 5
 
 
-def test_our_policy_acts_in_jax_as_in_numpy(tmp_path):
-    rng = np.random.default_rng(0)
+def written_policy(
+    rng, folder, *, has_norms=False, obs_clip=10.0, head="tanh_normal"
+) -> PlainPolicy:
     kernels = [rng.normal(size=shape).astype(np.float32) for shape in ((5, 8), (8, 4))]
     biases = [rng.normal(size=n).astype(np.float32) for n in (8, 4)]
-    ones = np.ones(5, np.float32)
-    policy = PlainPolicy(kernels, biases, 0.5 * ones, 2 * ones, 10.0, "tanh_normal", 2, {})
-    write_policy(tmp_path / POLICY, policy)
-    whose, found = policy_of(tmp_path, Sized)
+    norms = [tuple(rng.normal(size=(2, 8)).astype(np.float32))] if has_norms else []
+    mean, std = rng.uniform(1, 2, (2, 5)).astype(np.float32)
+    policy = PlainPolicy(kernels, biases, mean, std, obs_clip, head, 2, {}, norms)
+    write_policy(folder / POLICY, policy)
+    return policy
+
+
+@pytest.mark.parametrize("has_norms", [False, True])
+def test_our_policy_acts_in_jax_as_in_numpy(has_norms, tmp_path):
+    """And in the program of another one of its kind."""
+    rng = np.random.default_rng(0)
+    (tmp_path / "first").mkdir()
+    (tmp_path / "second").mkdir()
+    policies = [
+        written_policy(rng, tmp_path / name, has_norms=has_norms) for name in ("first", "second")
+    ]
+    first, second = (policy_of(tmp_path / name, Sized) for name in ("first", "second"))
     obs = rng.normal(size=(3, 8)).astype(np.float32)
     import jax
 
-    assert whose == "gmijax"
-    acted = jax.jit(found.act)(found.weights, obs)
-    assert np.asarray(acted) == pytest.approx(policy(obs), abs=1e-5)
+    assert first.kind == second.kind
+    assert first.kind[0] == "gmijax"
+    act = jax.jit(first.act)
+    assert np.asarray(act(first.weights, obs)) == pytest.approx(policies[0](obs), abs=1e-5)
+    assert np.asarray(act(second.weights, obs)) == pytest.approx(policies[1](obs), abs=1e-5)
+
+
+@pytest.mark.parametrize("change", [{"has_norms": True}, {"obs_clip": 5.0}, {"head": "normal"}])
+def test_a_policy_of_another_kind_has_a_program_of_its_own(change, tmp_path):
+    rng = np.random.default_rng(0)
+    kinds = []
+    for name, given in (("first", {}), ("second", change)):
+        (tmp_path / name).mkdir()
+        written_policy(rng, tmp_path / name, **given)
+        kinds.append(policy_of(tmp_path / name, Sized).kind)
+    assert kinds[0] != kinds[1]
 
 
 def test_a_policy_of_brax_gets_its_observations_by_name(tmp_path):
@@ -147,11 +185,11 @@ def test_a_policy_of_brax_gets_its_observations_by_name(tmp_path):
     checkpoint.save(tmp_path, 7, params, config)
     folder = tmp_path / f"{7:012d}"
     assert json.loads((folder / "ppo_network_config.json").read_text())["action_size"] == 2
-    whose, found = policy_of(folder, Sized)
+    found = policy_of(folder, Sized)
     obs = np.random.default_rng(0).normal(size=(3, 13)).astype(np.float32)
     named = {"state": obs[:, :5], "privileged_state": obs[:, 5:]}
     act = networks.make_inference_fn(network)(params, deterministic=True)
-    assert whose == "brax"
+    assert found.kind == ("brax",)
     acted = jax.jit(found.act)(found.weights, obs)
     assert np.asarray(acted) == pytest.approx(np.asarray(act(named, key)[0]), abs=1e-6)
 
@@ -187,20 +225,27 @@ def test_one_program_tests_all_checkpoints_of_a_kind(tmp_path, monkeypatch):
             pass
 
         def run(self, weights):
-            return SimpleNamespace(as_json=lambda: {"walks": weights > 1})
+            walk = SimpleNamespace(as_json=lambda: {"walks": weights > 1})
+            walk._replace = lambda settings: walk
+            return walk
 
     monkeypatch.setattr(walking_tests, "WalkingTest", Test)
     monkeypatch.setattr(walking_tests, "walking_env", lambda *_: None)
     monkeypatch.setattr(
-        walking_tests, "policy_of", lambda path, _: (path.suffix, Policy(None, int(path.stem)))
+        walking_tests,
+        "policy_of",
+        lambda path, _: Policy((path.suffix,), lambda *_: None, int(path.stem)),
     )
+    monkeypatch.setattr(walking_tests, "_trained_with", lambda path: "jax")
     env = to_dict(EnvConfig(suite="playground", name="g1_rough", episode_length=None))
     runs = [["1.a", "2.a", "3.a", "4.a"], ["5.b", "1.a"]]
-    asked = {"env": env, "impl": "jax", "num_envs": 4, "seed": 7, "runs": runs}
+    asked = {"env": env, "impls": ["auto", "jax"], "num_envs": 4, "seed": 7, "runs": runs}
     write_json(tmp_path / "in.json", asked)
     monkeypatch.setattr("sys.argv", ["x", str(tmp_path / "in.json"), str(tmp_path / "out.json")])
     assert walking_tests.main() == 0
-    found = [[one["walks"] for one in run] for run in read_json(tmp_path / "out.json")["walks"]]
+    written = read_json(tmp_path / "out.json")["walks"]
+    found = [[one["walks"] for one in run] for run in written]
+    assert {one["impl"] for run in written for one in run} == {"jax"}
     assert found == [[False, True, True], [True, False]]
     assert made == [("g1", {"num_envs": 4, "seed": 7})] * 2
 
@@ -213,15 +258,17 @@ def test_a_call_trains_tests_and_writes_what_it_found(works, tmp_path, monkeypat
         commands.append((command, variables))
         if "gmijax.train" in command:
             folder = RunPaths(Path(command[-2].removeprefix("run.dir=")))
-            for steps in (100, 200):
+            for steps in (100, 200, 300):
                 meta = CheckpointMeta("go1", "ppo", steps, 1, 4, ((8,), (8,)), "jax", time_s=1e9)
                 save_meta(folder, meta)
                 (folder.checkpoint(steps) / "gmi_0").mkdir()
-            lines = [{"env_steps": steps, "wall_s": steps / 10} for steps in (100, 200)]
+            lines = [{"env_steps": steps, "wall_s": steps / 10} for steps in (100, 200, 300)]
             folder.metrics.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
         elif "benchmarks.walking_tests" in command:
             asked = read_json(Path(command[-2]))
             walks = [[{"walks": "100" not in folder} for folder in run] for run in asked["runs"]]
+            if not works:  # It was stopped before the second that walks.
+                walks = [run[:2] for run in walks]
             write_json(Path(command[-1]), {"walks": walks})
             return 0 if works else 1
         return 0
@@ -232,7 +279,7 @@ def test_a_call_trains_tests_and_writes_what_it_found(works, tmp_path, monkeypat
         [
             *("walking", "env=go1", "num_envs=64", "num_timesteps=20480", "--seeds", "2"),
             *("--script=--impl=jax", f"--out={tmp_path}", f"--runs={tmp_path}", "--tests=4"),
-            *("--envs=8",),
+            *("--envs=100",),
         ],
     )
     assert walking.main() == (0 if works else 1)
@@ -242,12 +289,13 @@ def test_a_call_trains_tests_and_writes_what_it_found(works, tmp_path, monkeypat
     assert gmijax.compose(*ours[1][3:]).run.checkpoint_every == int(every[0].split("=")[1]) > 1
     theirs = [command for command, _ in commands if "--impl=jax" in command]
     assert len(theirs) == 3
-    assert theirs[1][3:5] == ["--env_name=Go1JoystickFlatTerrain", "--num_evals=5"]
+    assert {"--env_name=Go1JoystickFlatTerrain", "--num_evals=5"} <= set(theirs[1])
+    # How long a part is is compiled in.
+    assert theirs[0][-2:] == ["--num_timesteps=50000000", "--num_evals=2"]
     (path,) = tmp_path.glob("walking-go1-*.json")
     (call,) = read_calls(path)
     rows = call.results["rows"]
     assert "folder" not in call.results["runs"][0]["checkpoints"][0]
-    # Only of tests that all ran the last checkpoint alone is enough.
     assert (rows["gmijax"]["walk"], rows["gmijax"]["seeds"]) == (2 if works else 0, 2)
     assert rows["gmijax"]["training_s"] == ([20.0, 20.0, 20.0] if works else None)
     assert rows["train-jax-ppo"]["walk"] == 0

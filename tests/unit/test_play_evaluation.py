@@ -16,8 +16,10 @@ from gmijax.config import EnvConfig, PlayConfig
 from gmijax.config.schema import to_dict
 from gmijax.deploy import pictures, playing
 from gmijax.errors import ConfigError, GmijaxError
+from gmijax.learning.walking import walking_env
 from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
+from gmijax.player.joystick import ROBOTS
 from gmijax.runs.folder import EXIT_NO_GL, META, PlayPaths, RunPaths, write_json
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.start_gmi import environment_of
@@ -138,7 +140,35 @@ def test_a_walking_test_is_refused_where_there_is_none(
         playing.play(config)
 
 
-def test_without_a_walking_test_it_is_said_why():
+def test_a_robot_that_repeats_actions_has_no_walking_test(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    env = EnvConfig(suite="playground", name="go1", episode_length=None, action_repeat=2)
+    monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
+    monkeypatch.setattr(playing, "left_out", lambda checkpoint: None)
+    monkeypatch.setattr(playing, "require_env", lambda env: None)
+    said = "env.action_repeat=2; the walking test takes 1 only"
+    with pytest.raises(ConfigError, match=f"^walking_envs=8: {said}$"):
+        playing.play(config_of(f"run.dir={run.root}", "walking_envs=8"))
+    assert playing._walking(config_of(f"run.dir={run.root}"), None) == f"no walking test: {said}"
+    with pytest.raises(ConfigError, match=r"^env.action_repeat=2: the walking test takes 1 only$"):
+        walking_env(env, ROBOTS["go1"], "jax", 4)
+
+
+def test_a_robot_without_randomisation_cannot_be_played_with_one(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    env = EnvConfig(suite="playground", name="spot", episode_length=None)
+    monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
+    monkeypatch.setattr(playing, "left_out", lambda checkpoint: None)
+    monkeypatch.setattr(playing, "require_env", lambda env: None)
+    with pytest.raises(ConfigError, match="Playground has no randomisation for spot"):
+        playing.play(config_of(f"run.dir={run.root}", "randomize=on"))
+
+
+def test_without_a_walking_test_it_is_said_why(monkeypatch: pytest.MonkeyPatch):
+    env = EnvConfig(suite="playground", name="go1", episode_length=None)
+    monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
     assert "walking_envs=8" in playing._walking(config_of(), None)
     assert "walking_envs=0" in playing._walking(config_of("walking_envs=0"), None)
 

@@ -79,6 +79,7 @@ def test_names_of_playground_stay() -> None:
     ("overrides", "said"),
     [
         ("env.rewards.torqes=0", "unknown key env.rewards.torqes: did you mean torques?"),
+        ("+env.rewards.torqes=1", "unknown key env.rewards.torqes: did you mean torques?"),
         ("env.settings.noize=0", "unknown key env.settings.noize: did you mean noise?"),
         ("env.settings.noise=-1", "env.settings.noise=-1.0: must be at least 0"),
         ("env.settings.push=0.5", "env.settings.push=0.5: must be 0 or 1"),
@@ -108,6 +109,11 @@ def test_names_of_playground_stay() -> None:
 )
 def test_what_a_robot_cannot_have_is_one_line(overrides: str, said: str) -> None:
     assert refused("env=g1", overrides).startswith(said)
+
+
+def test_a_robot_by_its_long_name_has_no_other_terms() -> None:
+    said = refused("env=playground", "env.name=Go1JoystickFlatTerrain", "env.rewards.torqes=1")
+    assert said == "unknown key env.rewards.torqes: did you mean torques?"
 
 
 def test_commands_of_go1_have_no_negative_amplitude() -> None:
@@ -203,10 +209,10 @@ def test_settings_in_the_documents_are_those_of_the_code() -> None:
     rows = re.findall(
         r"^\| `(\w+)` \| (.*) \|$", TASKS_PAGE.partition("## Robots")[2], re.MULTILINE
     )
-    documented = {name: cells.split(" | ") for name, cells in rows if cells.count(" | ") == 4}
+    documented = [(name, cells.split(" | ")) for name, cells in rows if cells.count(" | ") == 4]
     for column, name in enumerate(("go1", "g1", "t1", "spot"), 1):
         fields = dataclasses.fields(ROBOT_SETTINGS[name])
-        found = {key: cells for key, cells in documented.items() if cells[column].strip()}
+        found = {key: cells for key, cells in documented if cells[column].strip()}
         assert {key: (cells[0], float(cells[column])) for key, cells in found.items()} == {
             field.name: (field.metadata["doc"], field.default) for field in fields
         }

@@ -13,6 +13,7 @@ from gmijax.config import EnvConfig
 from gmijax.config.env import ROBOTS as NAMES
 from gmijax.player.joystick import ROBOTS, Ground, robot_of, with_pushes
 from gmijax.player.walking import Recording, lines_of, measure
+from gmijax.sim.robots import changed_settings
 
 DT_S = 0.02
 GO1 = ROBOTS["go1"]
@@ -33,7 +34,7 @@ class Flat:
 
 
 def standing(steps: int = 200, envs: int = 1) -> dict[str, Any]:
-    """A robot that stands as it is told to, in `measure`'s arrays."""
+    """A robot that stands as commanded, in `measure`'s arrays."""
     qpos = np.zeros((steps, envs, 7 + 12), np.float32)
     qpos[..., 2], qpos[..., 3] = 0.3, 1
     zeros = np.zeros((steps, envs, 3), np.float32)
@@ -53,20 +54,53 @@ def walk_of(parts, model: Any = Flat):
     return measure(Recording(**parts), GO1, Ground(model), DT_S)
 
 
-def test_a_robot_that_stands_as_it_is_told_to_walks():
-    walk = walk_of(standing(envs=3))
-    assert walk.walks
-    assert (walk.num_envs, walk.length_s, walk.upright, walk.left) == (3, 4.0, 1.0, 0.0)
+def test_a_robot_that_stands_as_commanded_walks():
+    walk = walk_of(standing(envs=100))
+    assert walk.walks is True
+    assert (walk.num_envs, walk.length_s, walk.upright, walk.left) == (100, 4.0, 1.0, 0.0)
     assert walk.settled == walk.all_steps == (0.0, 0.0)
     assert (walk.load_rms, walk.load_p99, walk.jerk_rad_per_s3) == (0.5, 0.5, 0.0)
     assert "walks: yes" in lines_of(walk.as_json())[-1]
 
 
+def test_fewer_than_100_environments_are_too_few_to_say():
+    walk = walk_of(standing(envs=99))
+    assert walk.walks is None
+    assert lines_of(walk.as_json())[-1] == "  walks: too few to say (at least 100)"
+
+
+def test_a_policy_does_not_walk_if_more_than_half_leave_the_field():
+    flat = Field(np.zeros((2, 2)))
+    parts = standing(envs=100)
+    parts["qpos"][150:, :50, 0] = 9.6
+    walk = walk_of(parts, flat)
+    assert (walk.walks, walk.left, walk.upright) == (True, 0.5, 1.0)
+    parts["qpos"][150:, 50, 0] = 9.6
+    walk = walk_of(parts, flat)
+    assert (walk.walks, walk.left, walk.upright) == (False, 0.51, 1.0)
+    assert "left the field: 51.0% (at most 50%)" in "".join(lines_of(walk.as_json()))
+
+
+def test_settings_that_are_not_the_tasks_own_are_printed():
+    walk = walk_of(standing())
+    assert not any("settings" in line for line in lines_of(walk.as_json()))
+    settings = {"noise": 0.0, "command_forward_m_per_s": 0.3, "push": 1.0, "push_max_m_per_s": 3.0}
+    env = EnvConfig(suite="playground", name="go1", episode_length=None, settings=settings)
+    changed = changed_settings(env)
+    lines = lines_of(walk._replace(settings=changed).as_json())
+    assert lines[1] == (
+        "  settings that are not the task's own: noise=0, command_forward_m_per_s=0.3"
+    )
+
+
 def test_a_limp_robot_that_sinks_through_the_floor_has_fallen_though_the_task_goes_on():
+    parts = standing(envs=100)
+    parts["qpos"][100:, :2, 2] = -0.07
+    walk = walk_of(parts)
+    assert (walk.upright, walk.not_done, walk.walks) == (0.98, 1.0, False)
     parts = standing()
     parts["qpos"][100:, 0, 2] = -0.07
     walk = walk_of(parts)
-    assert (walk.upright, walk.not_done, walk.walks) == (0.0, 1.0, False)
     assert walk.falls == {"not_finite": 0, "low": 1, "tilted": 0, "done": 0}
 
 
@@ -106,12 +140,12 @@ def test_nothing_counts_from_a_fall_on():
 
 
 def test_errors_are_of_the_length_of_the_vector_and_root_mean_squares():
-    parts = standing(envs=2)
-    parts["command"][:, 0] = [0.3, 0.4, 0.2]
+    parts = standing(envs=100)
+    parts["command"][:, :50] = [0.3, 0.4, 0.2]
     walk = walk_of(parts)
     assert walk.all_steps.linear_m_per_s == pytest.approx(np.sqrt(0.25 / 2))
     assert walk.all_steps.yaw_rad_per_s == pytest.approx(np.sqrt(0.04 / 2))
-    assert not walk.walks
+    assert walk.walks is False
 
 
 def test_half_a_second_after_start_push_and_new_command_errors_do_not_count():
@@ -137,7 +171,9 @@ def test_one_that_leaves_the_field_is_neither_fall_nor_success():
     assert (walk.left, walk.upright, walk.not_done) == (0.25, 2 / 3, 1.0)
     assert walk.falls["low"] == 1
     first = walk_of({name: part[:, :1] for name, part in parts.items()}, flat)
-    assert (first.upright, first.walks) == (None, False)
+    assert first.upright is None
+    everywhere = {name: np.repeat(part[:, :1], 100, 1) for name, part in parts.items()}
+    assert walk_of(everywhere, flat).walks is False
 
 
 def test_heights_are_above_the_ground_under_the_robot():

@@ -15,7 +15,7 @@ import pytest
 
 import gmijax
 from gmijax.learning.learner import init_learner, make_learner
-from gmijax.learning.walking import WalkingTest
+from gmijax.learning.walking import WalkingTest, act_of
 from gmijax.player import walking
 from gmijax.player.joystick import ROBOTS, Readings
 from gmijax.sim.interface import Env, EnvSpec, EnvState
@@ -87,7 +87,7 @@ def reset(model, key) -> EnvState:
 
 
 def step(model, state: EnvState, action) -> EnvState:
-    """Does as it is told, in step k: forces of the action, and disturbances at fixed steps."""
+    """In step k: forces of the action, and disturbances at fixed steps."""
     del model
     number = state.steps + 1
     before = state.physics.data
@@ -169,13 +169,31 @@ def test_a_robot_without_limits_has_no_load():
 
 
 def test_starts_are_the_same_for_a_seed_and_others_for_another():
-    def keys(seed):
-        env = Env(SPEC, (), reset, step, mujoco.MjModel.from_xml_string(XML), lambda state: None)
-        test = WalkingTest(env, ROBOTS["go1"], lambda *_: None, num_envs=2, seed=seed)
-        return np.asarray(jax.random.key_data(test._keys))
+    model = mujoco.MjModel.from_xml_string(XML)
+    began = []
 
-    assert (keys(0) == keys(0)).all()
-    assert (keys(0) != keys(1)).any()
+    def noted(model, key):
+        jax.debug.callback(
+            lambda data: began.append(tuple(np.asarray(data).tolist())), jax.random.key_data(key)
+        )
+        return reset(model, key)
+
+    def keys(seed):
+        began.clear()
+        env = Env(SPEC, (), noted, step, model, lambda state: state.physics.data.qpos)
+        test = WalkingTest(env, ROBOTS["go1"], act, num_envs=2, seed=seed, length_s=1.0)
+        weights = jnp.zeros(2)
+        test.compile(weights)
+        test.run(weights)
+        jax.effects_barrier()
+        return set(began)
+
+    def act(weights, obs):
+        return jnp.broadcast_to(weights, (len(obs), 2))
+
+    # Of the environments' starts themselves: none is that of another, or of another seed.
+    assert keys(0) == keys(0)
+    assert len(keys(0) | keys(1)) == 4
 
 
 def test_playing_tests_the_policy_of_the_checkpoint(monkeypatch):
@@ -189,16 +207,28 @@ def test_playing_tests_the_policy_of_the_checkpoint(monkeypatch):
     beats = []
     link: Any = SimpleNamespace(beat=lambda *beat: beats.append(beat))
 
-    def walk(**changes):
+    task = gmijax.compose("env=go1", "env.settings.noise=0.5").env
+
+    def walk(task=task, **changes):
         config: Any = SimpleNamespace(seed=0, **changes)
-        return playback._walk(config, None, ROBOTS["go1"], "jax", link, learner, state)
+        return playback._walk(config, task, ROBOTS["go1"], "jax", link, learner, state)
 
     found = walk(walking_envs=2) or {}
     assert json.loads(json.dumps(found)) == found
-    assert (found["num_envs"], found["length_s"], found["walks"]) == (2, 20.0, False)
+    assert (found["num_envs"], found["length_s"], found["walks"]) == (2, 20.0, None)
+    assert found["settings"] == {"noise": 0.5}
     assert found["falls"] == {"not_finite": 0, "low": 0, "tilted": 0, "done": 2}
+    # Observations count the steps, torques are the actions; a fall is seen in the 55th step.
+    actions = act_of(learner)(state, jnp.arange(54, dtype=jnp.float32)[:, None])
+    loads = np.asarray(actions) / [3, 5]
+    assert found["load_rms"] == pytest.approx(np.sqrt((loads**2).mean()), rel=1e-4)
+    assert np.std(loads) > 1e-3
     assert beats[:2] == [("compiling", 0), ("running", 1)]
     assert beats[-1] == ("running", 20)
     assert walk(walking_envs=0) is None
+    assert walk(walking_envs=2, task=dataclasses.replace(task, action_repeat=2)) is None
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
+    monkeypatch.setattr(playback, "NUM_ENVS", 3)
+    assert (walk(walking_envs=None) or {})["num_envs"] == 3
     monkeypatch.setattr("jax.default_backend", lambda: "cpu")
     assert walk(walking_envs=None) is None

@@ -26,8 +26,8 @@ from gmijax.sim.adapters.checks import attempt
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.physics import which_overflowed
-from gmijax.sim.robot_models import model_folder
-from gmijax.sim.robots import BUFFERS, ROBOT_SETTINGS, has_randomizer, playground_name
+from gmijax.sim.robot_models import has_randomizer, model_folder
+from gmijax.sim.robots import BUFFERS, ROBOT_SETTINGS, playground_name
 from gmijax.sim.tasks.settings import settings_from
 from gmijax.types import Array, PRNGKey, PyTree
 
