@@ -15,7 +15,7 @@ from gmijax.runs.folder import (
     RunPaths,
     create_run,
     given_run,
-    replay_name,
+    replays_of,
     require_new_run,
 )
 from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpoint
@@ -120,7 +120,7 @@ def forgotten(config: TrainConfig, plan: Plan) -> str | None:
     if config.run.resume is None or replay is None:
         return None
     checkpoint = Path(config.run.resume)
-    is_saved = _has_replay(checkpoint)
+    is_saved = bool(replays_of(checkpoint))
     if not is_saved:
         why = (
             "is not in the checkpoint (algo.save_replay=true keeps it at the end of a run, or "
@@ -145,7 +145,7 @@ def require_replay_fits(config: TrainConfig, plan: Plan, checkpoint: Path | None
     replay = config.algo.kept_replay
     if checkpoint is None or replay is None or not replay.is_saved:
         return
-    if not _has_replay(checkpoint) or not _environments_go_on(config, plan, checkpoint):
+    if not replays_of(checkpoint) or not _environments_go_on(config, plan, checkpoint):
         return
     saved = trained_config(checkpoint)[1]
     for key in replay.keys:
@@ -186,10 +186,6 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
     if config.seed != seed:
         raise ConfigError(f"seed={config.seed}: a resumed run keeps its seed {seed}")
     return meta
-
-
-def _has_replay(checkpoint: Path) -> bool:
-    return any(checkpoint.glob(replay_name("*")))
 
 
 def _memory_of(env: EnvConfig) -> dict[str, object]:

@@ -29,7 +29,7 @@ from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, GmijaxError, NonFiniteError, ParameterMismatch, lines_of
 from gmijax.learning.episode_window import Standing
-from gmijax.runs.folder import META, RunPaths, read_json, replay_name, write_json
+from gmijax.runs.folder import META, RunPaths, read_json, replay_name, replays_of, write_json
 from gmijax.runs.resume import CheckpointMeta, checkpoints_of, file_check, rank_of
 from gmijax.types import PyTree
 
@@ -160,7 +160,7 @@ def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = 
     _sync(final.parent)
     if keep is not None:
         _remove_old(paths, keep, final)
-    if any(final.glob(replay_name("*"))):
+    if replays_of(final):
         _remove_old_replays(paths, final)
     return final
 
@@ -168,7 +168,7 @@ def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = 
 def _remove_old_replays(paths: RunPaths, last: Path) -> None:
     """Replays are kept in one checkpoint alone: they are many times as large as all else."""
     for checkpoint in checkpoints_of(paths.root):
-        replays = sorted(checkpoint.glob(replay_name("*")))
+        replays = replays_of(checkpoint)
         if checkpoint == last or not replays:
             continue
         # First the list of files, so that it is a whole checkpoint at any time.

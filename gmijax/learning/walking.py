@@ -112,8 +112,7 @@ def act_of(learner: Learner) -> Act:
 
     def act(state: PyTree, obs: Array) -> Array:
         weights = acting_weights(learner, state)
-        output = learner.networks.output(weights.params, normalize(weights.moments, obs))
-        return learner.networks.distribution.mode(output)
+        return learner.networks.action_mean(weights.params, normalize(weights.moments, obs))
 
     return act
 

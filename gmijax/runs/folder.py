@@ -189,6 +189,11 @@ def replay_name(gmi: int | str) -> str:
     return f"replay_{gmi}"
 
 
+def replays_of(checkpoint: Path) -> list[Path]:
+    """The folders of the replays in a checkpoint; empty where it has none."""
+    return sorted(checkpoint.glob(replay_name("*")))
+
+
 def given_run(run_dir: str | None, name: str | None) -> Path | None:
     """The run folder that the user names, None if none."""
     if run_dir:

@@ -82,7 +82,7 @@ def find_model(name: str) -> Path | None:
         return _whole(Path(root) / name)
     if importlib.util.find_spec(PACKAGE) is not None:
         # By name: it is not installed where gmijax is checked.
-        menagerie = importlib.import_module("mujoco_menagerie")
+        menagerie = importlib.import_module(PACKAGE)
         cache = menagerie.Cache()
         if name in menagerie.names() and cache.is_cached(robot := menagerie.get(name)):
             return _whole(cache.model_path(robot))

@@ -19,15 +19,16 @@ from gmijax.sim.impl import WarpSizes
 from gmijax.sim.tasks.settings import TaskSettings
 
 
+def _action_scale(default: float) -> Any:
+    what = "way of a joint's target from the default pose at full action, rad"
+    return doc(what, default=default, positive=True)
+
+
 @dataclass(frozen=True, kw_only=True)
 class RobotSettings(TaskSettings):
     """What all robots share. Pushes are forces of a moment, but for humanoids."""
 
-    action_scale_rad: float = doc(
-        "way of a joint's target from the default pose at full action, rad",
-        default=0.5,
-        positive=True,
-    )
+    action_scale_rad: float = _action_scale(0.5)
     noise: float = doc("factor of the noise in observations; 0: none", default=1.0, low=0)
     push: float = doc("1: the robot is pushed now and then; 0: never", default=0.0)
     push_min_m_per_s: float = doc(
@@ -116,11 +117,7 @@ class RangedSettings(RobotSettings):
 class HumanoidRobotSettings(RangedSettings):
     """`t1`, `t1_rough`, and what `g1` shares with it."""
 
-    action_scale_rad: float = doc(
-        "way of a joint's target from the default pose at full action, rad",
-        default=1.0,
-        positive=True,
-    )
+    action_scale_rad: float = _action_scale(1.0)
     push: float = doc("1: the robot is pushed now and then; 0: never", default=1.0)
     push_min_m_per_s: float = doc(
         "pushes: least change of the trunk's velocity, m/s", default=0.1, low=0
@@ -143,11 +140,7 @@ class HumanoidRobotSettings(RangedSettings):
 class G1Settings(HumanoidRobotSettings):
     """`g1`, `g1_rough`."""
 
-    action_scale_rad: float = doc(
-        "way of a joint's target from the default pose at full action, rad",
-        default=0.5,
-        positive=True,
-    )
+    action_scale_rad: float = _action_scale(0.5)
     push_max_m_per_s: float = doc(
         "pushes: largest change of the trunk's velocity, m/s", default=2.0, low=0
     )
@@ -159,11 +152,7 @@ class G1Settings(HumanoidRobotSettings):
 class SpotSettings(RangedSettings):
     """`spot`."""
 
-    action_scale_rad: float = doc(
-        "way of a joint's target from the default pose at full action, rad",
-        default=0.3,
-        positive=True,
-    )
+    action_scale_rad: float = _action_scale(0.3)
 
     def overrides(self) -> dict[str, Any]:
         """See `RobotSettings.overrides`. Its noise has no level."""
