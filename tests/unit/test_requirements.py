@@ -44,8 +44,21 @@ def requirements(*extras: str) -> dict[str, Requirement]:
     return {(found := Requirement(line)).name: found for line in lines}
 
 
-def modules_of(node: ast.AST) -> Iterator[str]:
-    """Modules that a statement or a call by name imports."""
+def constants(tree: ast.Module) -> dict[str, str]:
+    """Names of a file that stand for a text."""
+    found: dict[str, str] = {}
+    for node in tree.body:
+        match node:
+            case (
+                ast.Assign(targets=[ast.Name(id=name)], value=ast.Constant(value=str(text)))
+                | ast.AnnAssign(target=ast.Name(id=name), value=ast.Constant(value=str(text)))
+            ):
+                found[name] = text
+    return found
+
+
+def modules_of(node: ast.AST, names_of: dict[str, str]) -> Iterator[str]:
+    """Modules that a statement or a call by name imports; `names_of`: constants of its file."""
     match node:
         case ast.Import(names=names):
             yield from (alias.name for alias in names)
@@ -61,6 +74,11 @@ def modules_of(node: ast.AST) -> Iterator[str]:
                 arg.attr == "import_module" for arg in handed
             ):
                 texts = [str(arg.value) for arg in args if isinstance(arg, ast.Constant)]
+                texts += [
+                    names_of[arg.id]
+                    for arg in args
+                    if isinstance(arg, ast.Name) and arg.id in names_of
+                ]
                 yield from (text for text in texts if text.replace(".", "").isidentifier())
 
 
@@ -68,8 +86,10 @@ def imported() -> set[str]:
     """Distributions that the package imports from."""
     found: set[str] = set()
     for path in (ROOT / "gmijax").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            for module in modules_of(node):
+        tree = ast.parse(path.read_text())
+        names_of = constants(tree)
+        for node in ast.walk(tree):
+            for module in modules_of(node, names_of):
                 top = module.partition(".")[0]
                 if top == "gmijax" or top in sys.stdlib_module_names:
                     continue
