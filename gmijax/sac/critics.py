@@ -28,7 +28,10 @@ class Critics(NamedTuple):
     def init(self, key: PRNGKey, obs_size: int, action_size: int) -> PyTree:
         """First weights, of each its own; consumes `key`."""
         inputs = jnp.zeros((1, obs_size + action_size))
-        return jax.vmap(lambda k: self.network.init(k, inputs))(jax.random.split(key, NUM_CRITICS))
+        # One after the other: JAX 0.11 computes orthogonal matrices of a batch on the threads of
+        # its pool and waits for them on threads of the same pool; with two threads it hangs.
+        keys = jax.random.split(key, NUM_CRITICS)
+        return jax.lax.map(lambda k: self.network.init(k, inputs), keys)
 
     def log_probs(self, params: PyTree, obs: Array, action: Array) -> Array:
         """Logarithms of probabilities [2, B, Z] of the atoms."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +28,7 @@ from gmijax.learning.episode_window import Standing
 from gmijax.learning.member import Member, Members
 from gmijax.learning.normalize import moments_of, no_samples
 from gmijax.learning.start import begin_episodes
+from gmijax.machine.xla_on_cpu import POOL
 from gmijax.runs.folder import RunPaths
 from gmijax.sac import sac
 from gmijax.sac.critics import critics_of, projected
@@ -259,6 +263,34 @@ def test_targets_add_what_follows_unless_the_task_has_ended() -> None:
             0.1,
         )
         np.testing.assert_allclose(probs @ critics.atoms, wanted, rtol=1e-5)
+
+
+FIRST_STATE = """
+import jax, numpy as np
+from functools import partial
+from gmijax import compose
+from gmijax.learning.learner import make_learner
+from gmijax.sac.state import init
+from gmijax.sim.interface import EnvSpec
+learner = make_learner(EnvSpec("x", 24, 3, 0.02, 9, ()), compose("algo=sac").algo)
+state = jax.jit(partial(init, learner, 24))(jax.random.key(0))
+for leaf in jax.tree.leaves(state.critics):
+    if leaf.ndim == 3:
+        first, second = np.asarray(leaf)
+        assert not np.allclose(first, second)
+"""
+
+
+def test_critics_as_large_as_they_are_used_begin_on_two_cores() -> None:
+    cores = sorted(os.sched_getaffinity(0))[:2]
+    done = subprocess.run(
+        [sys.executable, "-c", FIRST_STATE],
+        preexec_fn=partial(os.sched_setaffinity, 0, cores),
+        env={k: value for k, value in os.environ.items() if k != POOL},
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0
 
 
 def test_what_is_not_known_is_not_learnt_from() -> None:
