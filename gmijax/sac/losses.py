@@ -66,6 +66,8 @@ def target_probs(
     after = critics.atoms - temperature * next_log_prob[:, None]
     values = batch.reward[:, None] + batch.discount[:, None] * after
     probs = jnp.exp(critics.log_probs(targets, batch.next_obs, next_action))
+    # Apart: XLA for GPUs would make one kernel of softmax and projection, and compile it for ever.
+    values, probs = jax.lax.optimization_barrier((values, probs))
     return jax.lax.stop_gradient(projected(critics.atoms, values, probs))
 
 
