@@ -86,10 +86,10 @@ def show_shipped(task: str, console: Console) -> None:
     finally:
         paths.model.unlink(missing_ok=True)
     again = f"gmijax play env={task} checkpoint=shipped"
-    others = [f"gmijax demo env={name}" for name in shipped_tasks() if name != task]
+    others = [name for name in shipped_tasks() if name != task]
     console.print(f"all of the episodes: {again}")
     if others:
-        console.print(f"other tasks: {', '.join(others)}")
+        console.print(f"other tasks: gmijax demo env=TASK, with {', '.join(others)}")
 
 
 def play_config(task: str) -> PlayConfig:

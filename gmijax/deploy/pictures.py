@@ -27,7 +27,7 @@ def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     with doing(console, "writing the page"), paths.page_log.open("wb") as log:
         exit_code = run_child("gmijax.workers.page_writer", paths, os.environ, log)
     if exit_code == 0:
-        console.print(f"page: {paths.html}")
+        console.print(f"page: {nearby(paths.html)}")
         return
     reason = f"no page: {last_line(paths.page_log)} (log: {paths.page_log})"
     if config.html == "on":

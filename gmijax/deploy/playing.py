@@ -198,10 +198,9 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
       ConfigError: no such run or checkpoint, or its task cannot be had.
     """
     if config.run.env is not None and ".py" not in config.run.env:
-        raise ConfigError(
-            f"env={config.run.env}: a run knows its task; add checkpoint=shipped for the policy "
-            "that comes with gmijax"
-        )
+        hint = f"; add checkpoint={SHIPPED} for the policy that comes with gmijax"
+        why = "a run knows its task" + ("" if isinstance(config, ExportConfig) else hint)
+        raise ConfigError(f"env={config.run.env}: {why}")
     checkpoint = checkpoint_of(config)
     early = None
     if config.checkpoint == "best" and not rank_of(checkpoint).is_full:

@@ -36,7 +36,7 @@ def test_films_have_the_wanted_size_and_play_in_real_time(home: Path):
     folder = home / "runs" / "made" / "play" / f"{ENV_STEPS:012d}"
     returns = json.loads((folder / "returns.json").read_text())
     longest = max(item["length"] for item in returns["episodes"])
-    assert f"page: {folder / 'view.html'}" in done.stdout
+    assert f"page: {(folder / 'view.html').relative_to(home)}\n" in done.stdout
     assert "__VISER_EMBED_DATA__" in (folder / "view.html").read_text()
     for name, fps in (("video.mp4", 25.0), ("video.gif", 12.5)):
         check_film(folder / name, fps, longest, done.stdout)

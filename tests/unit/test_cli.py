@@ -72,6 +72,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("play", "env=ant", "env=ant: a run knows its task; add checkpoint=shipped"),
     ("play", "env=antt checkpoint=shipped", "env=antt: no policy of it is shipped"),
     ("export", "env=ant", "unknown key env: did you mean run.env?"),
+    ("export", "run.env=ant", "env=ant: a run knows its task\n"),
     ("export", "run.dir=x tuned=ant_ppo", "unknown key tuned: allowed are checkpoint"),
     # Values of a wrong type, or out of range.
     ("train", "num_envs=many", "num_envs=many: expected an integer"),
