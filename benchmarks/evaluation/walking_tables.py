@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from benchmarks.records import RESULTS, Call, calls_by_date
 PATTERN = "walking-*-nvidia-*.json"
 HEAD = (
     "task | trained by | programs | seeds that walk: | million steps: | seconds of training: | "
-    "seconds of the command:"
+    "seconds of the command: | at the end: million steps: | do not fall: | error, m/s: | rad/s:"
 )
 
 
@@ -27,7 +28,13 @@ def walking() -> list[str]:
     if not newest:
         return [NOT_MEASURED]
     rows = [
-        [f"`{task}`", trainer, "compiled anew" if is_cold else "from the cache", *_cells(row)]
+        [
+            f"`{task}`",
+            trainer,
+            "compiled anew" if is_cold else "from the cache",
+            *_cells(row),
+            *_end(call, trainer),
+        ]
         for (task, _, is_cold), (call, _) in sorted(newest.items(), key=lambda item: item[0])
         for trainer, row in call.results["rows"].items()
     ]
@@ -42,6 +49,23 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
         _spread(row["training_s"]),
         _spread(row["command_s"]),
     ]
+
+
+def _end(call: Call, trainer: str) -> list[str]:
+    """The last test of every training: medians over seeds."""
+    runs = [run["checkpoints"] for run in call.results["runs"] if run["trainer"] == trainer]
+    tested = [[one for one in checkpoints if "walk" in one] for checkpoints in runs]
+    last = [checkpoints[-1] for checkpoints in tested if checkpoints]
+    walks = [one["walk"] for one in last]
+    figures = [
+        ("{:.0f}", [one["env_steps"] / 1e6 for one in last]),
+        ("{:.1%}", [walk["upright"] for walk in walks]),
+        ("{:.2f}", [walk["settled"]["linear_m_per_s"] for walk in walks]),
+        ("{:.2f}", [walk["settled"]["yaw_rad_per_s"] for walk in walks]),
+    ]
+    # None: all have left the field, or fallen at once.
+    known = [(form, [value for value in values if value is not None]) for form, values in figures]
+    return [form.format(statistics.median(values)) if values else "" for form, values in known]
 
 
 def _spread(values: Sequence[float] | None, scale: float = 1.0) -> str:

@@ -202,13 +202,17 @@ def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypat
         path = tmp_path / "walking-go1-nvidia-h100.json"
         file = ResultsFile(path, "walking", {"cold": is_cold}, device="H100")
         spread = {"training_s": [50.0, seconds, 120.0], "command_s": None}
+        errors = {"linear_m_per_s": seconds / 1000, "yaw_rad_per_s": None}
+        tested = {"env_steps": 7e7, "walk": {"upright": 0.995, "settled": errors}}
+        runs = [{"trainer": "gmijax", "checkpoints": [tested, {"env_steps": 8e7}]}] * 5
         with file.changing() as results:
-            results.update(task="go1", rows={"gmijax": row | spread})
+            results.update(task="go1", rows={"gmijax": row | spread}, runs=runs)
     lines = walking_tables.walking()
     rows = [line for line in lines if line.startswith("| `go1`")]
+    walk, share = "5 of 5 | 50 (40 to 60)", "70 | 99.5%"
     assert rows == [
-        "| `go1` | gmijax | from the cache | 5 of 5 | 50 (40 to 60) | 60 (50 to 120) |  |",
-        "| `go1` | gmijax | compiled anew | 5 of 5 | 50 (40 to 60) | 100 (50 to 120) |  |",
+        f"| `go1` | gmijax | from the cache | {walk} | 60 (50 to 120) |  | {share} | 0.06 |  |",
+        f"| `go1` | gmijax | compiled anew | {walk} | 100 (50 to 120) |  | {share} | 0.10 |  |",
     ]
 
 
