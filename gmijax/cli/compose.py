@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gmijax.cli.arguments import parse, readable, require_text
 from gmijax.cli.groups import choices, config_dir
+from gmijax.cli.near_key import near_key
 from gmijax.cli.saved import NAMED_BY_TASK, as_the_run_was, copy_key, with_saved
 from gmijax.config import EnvConfig, ServeConfig, TrainConfig
 from gmijax.config.env import choice_of
@@ -227,7 +228,7 @@ def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
         return ConfigError(
             f"{key}: this command is for one machine; gmijax.train and gmijax.sweep take several"
         )
-    return ConfigError(f"unknown key {key}{suggestion(key, known)}")
+    return ConfigError(f"unknown key {key}{near_key(key, set(known))}")
 
 
 def _on_top_of_saved(

@@ -324,7 +324,7 @@ def _what_is_left(run: RunPaths) -> str:
     if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
         return f"training was complete: {nearby(run.root)}"
     if checkpoints_of(run.root):
-        return f"continue with run.resume={shlex.quote(nearby(run.root))}"
+        return f"continue: gmijax train run.dir={shlex.quote(nearby(run.root))} run.resume=auto"
     if not read_metrics(run.metrics):
         return "training had not begun, so there is no checkpoint"
     return "there is no checkpoint: run.stop_timeout_s is the time that GMIs get to save one"

@@ -57,7 +57,7 @@ def find_start_point(config: TrainConfig) -> StartPoint:
     """
     if config.run.resume == "auto":
         return _go_on_or_start(config)
-    require_new_run(config.run.dir, config.run.name)
+    require_new_run(config.run.dir, config.run.name, "; run.resume=auto continues that run")
     if config.run.resume is None:
         return StartPoint()
     checkpoint, notes = choose_checkpoint(config.run.resume, "run.resume")

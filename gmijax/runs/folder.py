@@ -201,12 +201,15 @@ def given_run(run_dir: str | None, name: str | None) -> Path | None:
     return RUNS / name if name else None
 
 
-def require_new_run(run_dir: str | None, name: str | None) -> None:
-    """Raises ConfigError if the run folder that the user names exists already."""
+def require_new_run(run_dir: str | None, name: str | None, hint: str = "") -> None:
+    """Raises ConfigError if the run folder that the user names exists already.
+
+    `hint` is added where it is a folder.
+    """
     root = given_run(run_dir, name)
     if root is not None and os.path.lexists(root):
         key = "run.dir" if run_dir else "run.name"
-        what = "the run folder exists already" if root.is_dir() else "not a folder"
+        what = f"the run folder exists already{hint}" if root.is_dir() else "not a folder"
         raise ConfigError(f"{key}={root}: {what}")
 
 

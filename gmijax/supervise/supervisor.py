@@ -113,7 +113,7 @@ class Supervisor:
             raise
         self._end_all()
         if self._stop_requests:
-            raise JobInterrupted("stopped on request; every GMI has finished by itself")
+            raise JobInterrupted("stopped on request; all processes have finished their work")
 
     def _alive(self) -> list[WatchedGmi]:
         return [process for process in self._started.values() if process.exit_code is None]

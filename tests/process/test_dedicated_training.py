@@ -52,7 +52,7 @@ def test_trainers_of_two_gpus_stay_equal_and_a_stopped_run_goes_on(
     wait_until(lambda: iteration_of(run, 0) > 2, 240, "training")
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=90) == 130
-    assert "continue with run.resume" in (home / "stderr.txt").read_text()
+    assert "run.resume=auto" in (home / "stderr.txt").read_text()
     assert not pids_of(run)
     summary = json.loads((run / "summary.json").read_text())
     assert summary["plan"]["strategy"] == "mpr"

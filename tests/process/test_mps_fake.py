@@ -71,7 +71,7 @@ def train_and_stop(
                 supervisor.request_stop()
                 stopped.append(True)
 
-        with pytest.raises(JobInterrupted, match="every GMI has finished by itself"):
+        with pytest.raises(JobInterrupted, match="all processes have finished their work"):
             supervisor.run(stop_once)
     return directories
 

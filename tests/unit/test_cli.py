@@ -35,8 +35,17 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "env=antt", "env=antt: unknown: did you mean ant?"),
     ("train", "algo=td3", "algo=td3: unknown: allowed are a3c, distill, ppo, sac"),
     ("train", "num_env=3", "unknown key num_env: did you mean num_envs?"),
-    ("train", "algo.gamma=0.9", "unknown key algo.gamma"),
+    ("train", "algo.gamma=0.9", "unknown key algo.gamma: did you mean algo.discounting?"),
+    ("train", "lr=1", "unknown key lr: did you mean algo.learning_rate?"),
+    ("train", "total_timesteps=1", "unknown key total_timesteps: did you mean num_timesteps?"),
+    (
+        "train",
+        "plan.unroll_lenght=8",
+        "unknown key plan.unroll_lenght: did you mean algo.unroll_length?",
+    ),
+    ("play", "lr=1", "unknown key lr: allowed are"),
     ("train", "+foo.bar=1", "unknown key foo"),
+    ("train", "plan.xyzzy=1", "unknown key plan.xyzzy: see --help all"),
     ("train", "hydra.run.dir=x", "unknown key hydra.run.dir: did you mean run.dir?"),
     (
         "train",

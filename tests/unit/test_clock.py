@@ -188,7 +188,7 @@ def test_a_gmi_that_is_to_stop_is_not_late(tmp_path: Path, stop: Stop) -> None:
             supervisor.request_stop()
         is_so()
 
-    with pytest.raises(JobInterrupted, match="every GMI has finished by itself"):
+    with pytest.raises(JobInterrupted, match="all processes have finished their work"):
         supervisor.run(tick)
 
 

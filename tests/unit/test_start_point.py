@@ -161,7 +161,9 @@ def test_a_sweep_goes_on_in_a_folder_only(tmp_path: Path, name: str, said: str):
 
 
 def test_a_folder_that_exists_is_refused_before_anything_else(run: RunPaths):
-    with pytest.raises(ConfigError, match="the run folder exists already"):
+    with pytest.raises(
+        ConfigError, match=r"already; run\.resume=auto continues"
+    ):
         find_start_point(compose("env=ant", f"run.dir={run.root}", "num_envs=auto"))
 
 
@@ -176,7 +178,10 @@ def test_serve_refuses_a_name_that_is_taken_before_it_searches(
     monkeypatch.setattr(decide, "with_auto_decided", search)
     overrides = ("policy=random", "num_envs=auto", "run.name=mine")
     config = compose(*overrides, command="serve")
-    with pytest.raises(ConfigError, match=r"^run\.name=runs/mine: the run folder exists already$"):
+    with pytest.raises(
+        ConfigError,
+        match=r"^run\.name=runs/mine: the run folder exists already$",
+    ):
         serving.serve(config)
 
 

@@ -1,0 +1,43 @@
+"""The key that a misspelt one may mean, or one that other libraries call so."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Mapping
+from types import MappingProxyType
+
+from gmijax.config.schema import suggestion
+
+_ELSEWHERE: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(("lr", "learning_rate"), "algo.learning_rate"),
+        **dict.fromkeys(("gamma", "discount"), "algo.discounting"),
+        **dict.fromkeys(("lam", "lambda", "gae_lambda"), "algo.gae_lambda"),
+        **dict.fromkeys(("clip", "clip_range", "clip_param"), "algo.clipping_epsilon"),
+        **dict.fromkeys(("ent_coef", "entropy_coef"), "algo.entropy_cost"),
+        **dict.fromkeys(("epochs", "n_epochs", "num_epochs"), "algo.num_updates_per_batch"),
+        **dict.fromkeys(("n_envs", "envs"), "num_envs"),
+        **dict.fromkeys(("n_steps", "num_steps"), "algo.unroll_length"),
+        **dict.fromkeys(("steps", "timesteps", "total_timesteps"), "num_timesteps"),
+    }
+)
+"""What Stable-Baselines3, CleanRL and rsl_rl call it."""
+
+_MOST_SHOWN = 24
+"""Keys that an error lists; the help has more."""
+
+
+def near_key(key: str, known: Collection[str]) -> str:
+    """`: did you mean ...` for a key that none of `known` is, else what is allowed, or the help.
+
+    The last part of a key counts more than its group: `algo.gamma` is no `algo.name`.
+    """
+    name = key.rpartition(".")[2]
+    if (meant := _ELSEWHERE.get(name.lower().replace("-", "_"))) in known:
+        return f": did you mean {meant}?"
+    names = {one.rpartition(".")[2] for one in known}
+    if close := difflib.get_close_matches(name, sorted(names), n=1, cutoff=0.75):
+        so_called = sorted(one for one in known if one.rpartition(".")[2] == close[0])
+        return f": did you mean {difflib.get_close_matches(key, so_called, n=1, cutoff=0.0)[0]}?"
+    hint = suggestion(key, known)
+    return hint if len(known) <= _MOST_SHOWN or "did you mean" in hint else ": see --help all"
