@@ -161,9 +161,7 @@ def test_a_sweep_goes_on_in_a_folder_only(tmp_path: Path, name: str, said: str):
 
 
 def test_a_folder_that_exists_is_refused_before_anything_else(run: RunPaths):
-    with pytest.raises(
-        ConfigError, match=r"already; run\.resume=auto continues"
-    ):
+    with pytest.raises(ConfigError, match=r"already; run\.resume=auto continues"):
         find_start_point(compose("env=ant", f"run.dir={run.root}", "num_envs=auto"))
 
 
