@@ -56,7 +56,7 @@ CODES = {"completed": 0, "interrupted": 130}
 """States of trainings that have saved, the last one at the deadline."""
 
 EVALUATIONS = 5
-"""Of a training; the best one's checkpoint is shipped."""
+"""Of a training; the best one's checkpoint is shipped, or the last one."""
 
 
 class Recipe(NamedTuple):
@@ -137,13 +137,15 @@ def overrides(task: str, given: argparse.Namespace) -> Sequence[str]:
 def keep(
     task: str, code: int, run_dir: Path, given: argparse.Namespace, file: ResultsFile
 ) -> None:
-    """Ships the best checkpoint of a run, and writes down where it is from."""
-    saved = checkpoints_of(run_dir)
-    best = saved[-1] if RECIPES[task].ships_last and saved else best_checkpoint(run_dir)
-    if best is None:
+    """Ships a checkpoint of a run, and writes down where it is from."""
+    if RECIPES[task].ships_last:
+        checkpoint = next(reversed(checkpoints_of(run_dir)), None)
+    else:
+        checkpoint = best_checkpoint(run_dir)
+    if checkpoint is None:
         sys.stdout.write(f"{task}: no checkpoint\n")
         return
-    steps = CheckpointMeta.read(best).env_steps
+    steps = CheckpointMeta.read(checkpoint).env_steps
     lines = [line for line in read_metrics(RunPaths(run_dir).metrics) if "eval/return" in line]
     evaluations = [
         {"env_steps": line["env_steps"], "return": line["eval/return"], **_of(line)}
@@ -151,7 +153,7 @@ def keep(
     ]
     trained_s = next((line["wall_s"] for line in lines if line["env_steps"] == steps), None)
     summary = read_json(RunPaths(run_dir).summary)
-    policy = read_policy(best / POLICY)
+    policy = read_policy(checkpoint / POLICY)
     about = {**policy.about, "device": device_name(), "train_wall_s": trained_s}
     given.policies.mkdir(parents=True, exist_ok=True)
     path = given.policies / f"{task}.npz"

@@ -6,7 +6,6 @@ import difflib
 import os
 import re
 import shlex
-import shutil
 import unicodedata
 from collections.abc import Sequence
 
@@ -95,9 +94,7 @@ def _meant(word: str) -> str:
         return f"; did you mean run.dir={word}?"
     groups = {name: group for group in ("env", "algo") for name in choices(group)}
     close = difflib.get_close_matches(word, groups, n=1)
-    if close:
-        return f"; did you mean {groups[close[0]]}={close[0]}?"
-    return "; a command to run comes after --" if shutil.which(word) else ""
+    return f"; did you mean {groups[close[0]]}={close[0]}?" if close else ""
 
 
 def _unreadable(text: str, error: HydraException) -> ConfigError:

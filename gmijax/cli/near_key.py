@@ -10,9 +10,9 @@ from gmijax.config.schema import suggestion
 
 _ELSEWHERE: Mapping[str, str] = MappingProxyType(
     {
-        **dict.fromkeys(("lr", "learning_rate"), "algo.learning_rate"),
+        "lr": "algo.learning_rate",
         **dict.fromkeys(("gamma", "discount"), "algo.discounting"),
-        **dict.fromkeys(("lam", "lambda", "gae_lambda"), "algo.gae_lambda"),
+        **dict.fromkeys(("lam", "lambda"), "algo.gae_lambda"),
         **dict.fromkeys(("clip", "clip_range", "clip_param"), "algo.clipping_epsilon"),
         **dict.fromkeys(("ent_coef", "entropy_coef"), "algo.entropy_cost"),
         **dict.fromkeys(("epochs", "n_epochs", "num_epochs"), "algo.num_updates_per_batch"),
@@ -39,5 +39,6 @@ def near_key(key: str, known: Collection[str]) -> str:
     if close := difflib.get_close_matches(name, sorted(names), n=1, cutoff=0.75):
         so_called = sorted(one for one in known if one.rpartition(".")[2] == close[0])
         return f": did you mean {difflib.get_close_matches(key, so_called, n=1, cutoff=0.0)[0]}?"
-    hint = suggestion(key, known)
-    return hint if len(known) <= _MOST_SHOWN or "did you mean" in hint else ": see --help all"
+    if len(known) <= _MOST_SHOWN or difflib.get_close_matches(key, known, n=1):
+        return suggestion(key, known)
+    return ": see --help all"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -76,6 +77,9 @@ def build_pack(words: Sequence[str], program: Sequence[str]) -> PackWork:
     Raises:
       ConfigError: bad input.
     """
+    for word in words:
+        if "=" not in word and shutil.which(word):
+            raise ConfigError(f"{word}: expected key=value; a command to run comes after --")
     words = [_as_text(word) for word in words]
     given = list(zip(words, parse(words), strict=True))
     own = [text for text, item in given if item.key_or_group.startswith(_OWN)]

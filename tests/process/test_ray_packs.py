@@ -8,7 +8,6 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from ray_cluster import RAY, two_nodes
@@ -26,10 +25,7 @@ number, steps, folder = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 with open(f"{folder}/starts", "a") as starts:
     print(os.getpid(), file=starts)
 for step in range(1, steps + 1):
-    if os.path.exists("finish"):
-        time.sleep(0.01)
-    else:
-        time.sleep(0.1)
+    time.sleep(0.01 if os.path.exists("finish") else 0.1)
     print(f"|    ep_rew_mean     | {number + step:.3g} |")
     print(f"|    total_timesteps | {step * 512} |", flush=True)
 """
@@ -45,10 +41,6 @@ def test_a_pack_over_two_nodes_finishes_on_one_when_the_other_is_killed(tmp_path
     folder, errors = tmp_path / "all", tmp_path / "stderr.txt"
     (tmp_path / "trainer.py").write_text(TRAINER)
     command = ("--", sys.executable, "trainer.py", "{seed}", "{steps}", "{run_dir}")
-
-    def report() -> list[dict[str, Any]]:
-        path = folder / "pack.json"
-        return json.loads(path.read_text())["jobs"] if path.exists() else []
 
     def have_reported() -> bool:
         """Whether both of the first jobs have."""
@@ -67,7 +59,7 @@ def test_a_pack_over_two_nodes_finishes_on_one_when_the_other_is_killed(tmp_path
             kill(pack.pid)
             pack.wait()
 
-    rows = report()
+    rows = json.loads((folder / "pack.json").read_text())["jobs"]
     assert [row["state"] for row in rows] == ["completed"] * 4
     starts = [len((folder / f"{job:03d}/starts").read_text().split()) for job in range(4)]
     assert sorted(starts[:2]) == [1, 2]  # That of the node that was killed ran on the other one.

@@ -44,6 +44,8 @@ REFUSED: list[tuple[str, str, str]] = [
         "unknown key plan.unroll_lenght: did you mean algo.unroll_length?",
     ),
     ("play", "lr=1", "unknown key lr: allowed are"),
+    ("train", "sh", "sh: expected key=value\n"),
+    ("pack", "seed=0,1 sh", "sh: expected key=value; a command to run comes after --"),
     ("train", "+foo.bar=1", "unknown key foo"),
     ("train", "plan.xyzzy=1", "unknown key plan.xyzzy: see --help all"),
     ("train", "hydra.run.dir=x", "unknown key hydra.run.dir: did you mean run.dir?"),

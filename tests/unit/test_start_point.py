@@ -176,10 +176,7 @@ def test_serve_refuses_a_name_that_is_taken_before_it_searches(
     monkeypatch.setattr(decide, "with_auto_decided", search)
     overrides = ("policy=random", "num_envs=auto", "run.name=mine")
     config = compose(*overrides, command="serve")
-    with pytest.raises(
-        ConfigError,
-        match=r"^run\.name=runs/mine: the run folder exists already$",
-    ):
+    with pytest.raises(ConfigError, match=r"^run\.name=runs/mine: the run folder exists already$"):
         serving.serve(config)
 
 
