@@ -17,8 +17,8 @@ pytestmark = [pytest.mark.gpu, pytest.mark.timeout(900)]
 def test_networks_as_large_as_they_are_used_learn(updates: int, tmp_path: Path) -> None:
     # XLA for GPUs once compiled the updates without end, which small networks do not show.
     done = train(
-        *("env=ball_balance", "physics.impl=jax", "algo=sac", "num_envs=256"),
-        *(f"algo.updates_per_step={updates}", f"num_timesteps={20 * 16 * 256}"),
+        *("env=ball_balance", "physics.impl=jax", "algo=sac", "num_envs=1024"),
+        *(f"algo.updates_per_step={updates}", f"num_timesteps={20 * 16 * 1024}"),
         *("run.measure_throughput=false", "run.dir=run"),
         cwd=tmp_path,
         timeout_s=580.0,
