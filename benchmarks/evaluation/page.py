@@ -6,6 +6,7 @@ from benchmarks.evaluation import (  # noqa: F401  Each registers its tables.
     claims,
     front,
     learning_tables,
+    off_policy_tables,
     seed_tables,
     walking_tables,
 )

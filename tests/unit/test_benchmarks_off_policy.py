@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.evaluation.off_policy_tables import over_the_same_ratio
 from benchmarks.off_policy import LEAD, held_rate, summary
 
 
@@ -66,3 +67,12 @@ def test_gains_are_medians_by_backend():
     ]
     found = {backend: gain["held"] for backend, gain in summary(repeats).items()}
     assert found == pytest.approx({"mps": 1.2, "share": 0.5})
+
+
+def test_free_gmis_are_compared_with_one_program_of_their_ratio() -> None:
+    # A round takes one program 10 ms and its two updates 20 ms; the two GMIs make 50 rounds/s.
+    repeat = {
+        "in_turn": {"acting_alone_rounds_per_s": 100.0, "learning_alone_updates_per_s": 100.0},
+        "two_gmis": {"free_rounds_per_s": 50.0, "free_updates_per_s": 100.0},
+    }
+    assert over_the_same_ratio(repeat) == pytest.approx(1.5)
