@@ -5,7 +5,8 @@ A figure in a text stands in a marker, `<!-- figure: FILE.json#PATH FORMAT -->1.
 `<!-- table: NAME -->` and `<!-- /table -->`. `fill` writes what belongs there. What looks like a
 measurement elsewhere is a finding, but for code and lines that end with `<!-- no figure -->`:
 limits, examples, and what others report. Figures of a decision are of its day: one that says "as
-measured then" may have some without a file.
+measured then" may have some without a file. A file of results has the commit that it was measured
+with, or `benchmarks/plan.md` says how it will be measured again.
 """
 
 from __future__ import annotations
@@ -19,9 +20,13 @@ from typing import NamedTuple
 from benchmarks.evaluation.figures import look_up
 from benchmarks.evaluation.page import TABLES
 from benchmarks.evaluation.plots import FOLDER, PICTURES, is_current
+from benchmarks.records import RESULTS, read_calls
 from gmijax.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
+PLAN = ROOT / "benchmarks" / "plan.md"
+OF_FILES = "| files |"
+"""Where the plan's table of files begins."""
 FIGURE = re.compile(r"(<!-- figure: ([^>]+?) (\S+) -->)(.*?)(<!-- /figure -->)")
 TABLE = re.compile(r"(<!-- table: (\S+) -->\n)(.*?)(<!-- /table -->)", re.DOTALL)
 NO_FIGURE = "<!-- no figure -->"
@@ -84,7 +89,32 @@ def check(root: Path = ROOT) -> list[Finding]:
         if not is_current(name):
             path = (FOLDER / f"{name}.svg").relative_to(ROOT).as_posix()
             found.append(Finding(path, 1, name, "its numbers are not those of the files"))
-    return found
+    return [*found, *without_commit()]
+
+
+def without_commit(results: Path = RESULTS, plan: Path = PLAN) -> Iterator[Finding]:
+    """Files without a commit that the plan does not name, and the reverse."""
+    text = plan.read_text()
+    planned = {name: text.count("\n", 0, at) + 1 for name, at in _planned(text)}
+    for path in sorted(results.glob("*.json")):
+        has_commit = all(call.commit for call in read_calls(path))
+        if (line := planned.pop(path.stem, None)) is None and not has_commit:
+            yield Finding(
+                path.name, 1, path.stem, f"has no commit, and {plan.name} has no row of it"
+            )
+        elif line is not None and has_commit:
+            yield Finding(plan.name, line, path.stem, "has a commit: its row is done")
+    for name, line in planned.items():
+        yield Finding(plan.name, line, name, "there is no such file of results")
+
+
+def _planned(text: str) -> Iterator[tuple[str, int]]:
+    """Names of files in the first column of the first table, and where they stand."""
+    begin = text.index(OF_FILES)
+    end = text.find("\n## ", begin)
+    for row in re.finditer(r"^\|([^|]*)\|", text[begin:end], re.MULTILINE):
+        for name in re.finditer(r"`([^`]+)`", row[1]):
+            yield name[1], begin + row.start() + name.start()
 
 
 def in_document(path: Path, root: Path = ROOT) -> Iterator[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -117,3 +118,20 @@ def test_paths_take_medians_names_and_keys_with_slashes():
     assert look_up("templates-ant.json#2 GMIs x 2048, tcg_ex/runs/0/medians/time/rollout_s") < 1
     with pytest.raises(ConfigError, match="has no"):
         look_up("ant-1gpu.json#4 GMIs x 2048, mps/none")
+
+
+def test_results_without_a_commit_are_planned_again(tmp_path: Path):
+    plan = tmp_path / "plan.md"
+    for name, commit in (("old", None), ("new", "abc1234")):
+        calls = [{"commit": commit, "results": {}}]
+        (tmp_path / f"{name}.json").write_text(json.dumps({"format": 2, "calls": calls}))
+    rows = "| files | command |\n|---|---|\n| {} | `python -m other` |\n\n## Other\n| `x` | |\n"
+    plan.write_text(rows.format("`old`"))
+    assert [*check.without_commit(tmp_path, plan)] == []
+    plan.write_text(rows.format("`new`, `gone`"))
+    found = [*check.without_commit(tmp_path, plan)]
+    assert [(one.file, one.line, one.text) for one in found] == [
+        ("plan.md", 3, "new"),
+        ("old.json", 1, "old"),
+        ("plan.md", 3, "gone"),
+    ]
