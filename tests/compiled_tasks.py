@@ -18,7 +18,7 @@ T = TypeVar("T")
 NUM_ENVS = 8
 EPISODE_LENGTH = 25
 NUM_STARTS = 4
-"""Worlds that `converged_step` is called with: it is compiled once."""
+"""Environments that `converged_step` is called with: it is compiled once."""
 
 
 def on_device(state: T) -> T:
@@ -67,7 +67,7 @@ class CompiledTask:
     def converged_step(
         self,
     ) -> Callable[..., tuple[physics.PhysicsState, jax.Array]]:
-        """`(model, state, ctrl) -> (state, sensordata)` of `converged`, of NUM_STARTS worlds."""
+        """`(model, state, ctrl) -> (state, sensordata)` of NUM_STARTS `converged` environments."""
         return jax.jit(jax.vmap(self.converged.step, in_axes=(None, 0, 0)))
 
     @property

@@ -1,4 +1,4 @@
-"""The task, what of its model may be drawn for every world, and its simulator."""
+"""The task, what of its model may be drawn for every environment, and its simulator."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from gmijax.sim.physics import Physics
 
 C: Final = "c"
-"""The implementation that is MuJoCo in C: one world in numpy, for the player."""
+"""The implementation that is MuJoCo in C: one environment in numpy, for the player."""
 
 
 def load_model(asset: str) -> mujoco.MjModel:
@@ -27,7 +27,7 @@ def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -
       asset: see `load_model`.
       impl: `auto`, `jax` or `warp`, see `gmijax.sim.physics.load`; `c`: `gmijax.sim.c_physics`.
       substeps: physics steps per control step.
-      max_envs: upper bound of worlds simulated at once, None for no limit.
+      max_envs: upper bound of environments simulated at once, None for no limit.
 
     Raises:
       ConfigError: `impl` cannot be had, or the model needs state that is not carried.
@@ -35,8 +35,8 @@ def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -
     if impl == C:
         from gmijax.sim.c_physics import CPhysics
 
-        world: Any = CPhysics(load_model(asset), substeps)
-        return world
+        sim: Any = CPhysics(load_model(asset), substeps)
+        return sim
     from gmijax.sim import physics
 
     return physics.load(asset, impl=impl, substeps=substeps, max_envs=max_envs)

@@ -97,10 +97,10 @@ def make_vector_env(
         Stable-Baselines3, `rsl_rl` for one of rsl_rl.
       arrays: what goes in and comes out, of `gymnasium` only: `numpy` (default), `torch`, on the
         GPU of jax without a copy (DLPack) where both use one, or `jax`.
-      autoreset: when a world that has ended starts over, of `gymnasium` only: `same_step`
+      autoreset: when an environment that has ended starts over, of `gymnasium` only: `same_step`
         (default), `next_step`, which its wrappers of observations want, or `disabled`.
-      render_mode: `rgb_array` for pictures of all worlds by `render()`, not of `rsl_rl`; needs
-        OpenGL.
+      render_mode: `rgb_array` for pictures of all environments by `render()`, not of `rsl_rl`;
+        needs OpenGL.
       suite: see `make_env`.
       impl: see `make_env`.
       episode_length: see `make_env`.

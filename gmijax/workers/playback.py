@@ -38,13 +38,13 @@ def _run(link: ChildLink) -> None:
     from gmijax.learning.episodes import EpisodeOptions, run_episodes
     from gmijax.learning.learner import make_learner
     from gmijax.sim.camera import check_camera, choose_camera
-    from gmijax.sim.randomize import make_worlds
+    from gmijax.sim.randomize import make_envs
     from gmijax.sim.trajectory import MOST_RECORDED
 
     impl = _impl(config, checkpoint, env_config)
     # At its full range: what was learnt in the end is what counts.
     played = dataclasses.replace(env_config, randomize=config.randomize, curriculum="off")
-    env = make_worlds(played, impl, seed=config.seed, first_env=0, num_envs=config.num_envs)
+    env = make_envs(played, impl, seed=config.seed, first_env=0, num_envs=config.num_envs)
     check_camera(env.mj_model, config.camera, env.spec.name)
     learner = make_learner(env.spec, algo)
     state = saved_state(checkpoint, learner, env.spec.obs_size)

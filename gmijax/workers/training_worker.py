@@ -195,11 +195,11 @@ def _run_asynchronous(
 
 def environments(config: TrainConfig, place: int) -> BatchedEnv:
     """The environments of the GMI that is number `place` of those that simulate."""
-    from gmijax.learning.start import worlds_of
+    from gmijax.learning.start import envs_of
     from gmijax.sim.wrappers import training_env
 
     random_ep_len = config.algo.init_at_random_ep_len
-    return training_env(worlds_of(config, place), random_ep_len=random_ep_len)
+    return training_env(envs_of(config, place), random_ep_len=random_ep_len)
 
 
 def _trainers_communicator(

@@ -120,7 +120,7 @@ def test_a_checkpoint_that_cannot_be_meant_is_bad_input(
         playing.checkpoint_of(config)
 
 
-def test_worlds_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytest.MonkeyPatch):
+def test_envs_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytest.MonkeyPatch):
     env = EnvConfig(name="ant", episode_length=None)
     monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
     monkeypatch.setattr(playing, "left_out", lambda checkpoint: None)

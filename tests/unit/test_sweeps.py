@@ -351,7 +351,7 @@ def test_a_job_is_ranked_by_its_last_full_window(key: str, direction: Any) -> No
         (-140.0, True, 175),
     ]
     assert progress.curve == [(400, -137.0), (500, -140.0)]
-    # Worlds that begin anew after a restart: what was measured before is better.
+    # Environments that begin anew after a restart: what was measured before is better.
     progress.take(lines_of((-9.0, 120, False), key=key)[0], sweep)
     assert (progress.value, progress.is_full) == (-140.0, True)
 

@@ -1,4 +1,4 @@
-"""How worlds of MuJoCo Warp are handed over, without Warp: layout, maps over worlds, readings."""
+"""How environments are handed to MuJoCo Warp, without Warp: layout, maps, readings."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from gmijax.sim.impl import WarpSizes
+from gmijax.sim.warp.batch import MODEL_LEAVES, OVERFLOW, STATE, lay_out
 from gmijax.sim.warp.step import WarpStep
-from gmijax.sim.warp.worlds import MODEL_LEAVES, OVERFLOW, STATE, lay_out
 
 JOBS, WORLDS = 2, 3
 SHAPES = {**dict.fromkeys((*STATE, "ctrl"), (2,)), OVERFLOW: (), "sensordata": (4,)}
@@ -35,7 +35,7 @@ def test_arrays_of_the_buffer_are_apart_and_what_goes_in_and_comes_out_is_in_a_r
 
 
 class Arithmetic(WarpStep):
-    """Worlds whose step is a sum, and how many of them and of each leaf were stepped at once."""
+    """Steps that are sums, and how many environments and rows of leaves were stepped at once."""
 
     seen: list[tuple[int, dict[str, int]]]
 
@@ -65,7 +65,7 @@ def model_with(body_mass: jax.Array) -> Any:
 @pytest.mark.parametrize(
     ("mass_shape", "rows"), [((2,), 1), ((WORLDS, 2), JOBS * WORLDS), ((JOBS, 1, 2), 6)]
 )
-def test_a_map_over_jobs_and_worlds_is_one_call_of_all_worlds(
+def test_a_map_over_jobs_and_environments_is_one_call_of_all_environments(
     step: Arithmetic, mass_shape: tuple[int, ...], rows: int
 ):
     rng = np.random.default_rng(0)
@@ -75,10 +75,10 @@ def test_a_map_over_jobs_and_worlds_is_one_call_of_all_worlds(
     def one(body_mass: jax.Array, state: Any, ctrl: jax.Array) -> Any:
         return step(model_with(body_mass), state, ctrl, lambda data: data.sensordata[:2])
 
-    of_worlds = 0 if mass_shape == (WORLDS, 2) else None
+    of_envs = 0 if mass_shape == (WORLDS, 2) else None
     of_jobs = 0 if mass_shape == (JOBS, 1, 2) else None
     mass = mass.reshape(JOBS, 2) if of_jobs == 0 else mass
-    mapped = jax.vmap(jax.vmap(one, (of_worlds, 0, 0)), (of_jobs, 0, None))
+    mapped = jax.vmap(jax.vmap(one, (of_envs, 0, 0)), (of_jobs, 0, None))
     moved, reading = jax.jit(mapped)(mass, state, ctrl)
     factor = mass[:, None] if of_jobs == 0 else mass
     for name in STATE:
@@ -95,7 +95,7 @@ def test_a_task_may_read_the_controls(step: Arithmetic):
     assert read.tolist() == [2.0, 4.0]
 
 
-def test_what_the_data_do_not_have_for_each_world_is_named(step: Arithmetic):
+def test_what_the_data_do_not_have_for_each_environment_is_named(step: Arithmetic):
     state = {name: jnp.zeros(2) for name in STATE}
     with pytest.raises(AttributeError, match=r"^data\.contact: MuJoCo Warp has no such array"):
         step(model_with(jnp.ones(2)), state, jnp.zeros(2), lambda data: data.contact)

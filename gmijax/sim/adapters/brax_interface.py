@@ -35,10 +35,10 @@ WithModel = Callable[[PyTree], AbstractContextManager[None]]
 
 
 class Carried(NamedTuple):
-    """What a world takes from one episode to the next.
+    """What an environment takes from one episode to the next.
 
     Attributes:
-      first: their state at the world's first start, with an empty `info`.
+      first: their state at the environment's first start, with an empty `info`.
       info: of their state now: what Brax's and Playground's automatic resets leave alone, such as
         the random key that new commands are drawn from.
     """
@@ -70,7 +70,7 @@ def adapt(
     does. `done` terminates, unless `info["truncation"]` says that time ran out.
 
     Args:
-      theirs: their environment, one world, without wrappers.
+      theirs: one of their environments, without wrappers.
       name: for messages and logs.
       episode_length: steps after which an episode is truncated.
       mj_model: the MuJoCo model to film it with, None for no films.
