@@ -18,10 +18,10 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RUNS, given_run, read_json, write_json
 from gmijax.runs.held import OpenFolder, locked
 from gmijax.supervise.run_gmis import StopSignals, stop_signals
+from gmijax.sweeps.any_job import J
 from gmijax.sweeps.events import JobEvents
 from gmijax.sweeps.folder import errors_of_files, opened_folder
 from gmijax.sweeps.host import LocalHost
-from gmijax.sweeps.kind import J
 from gmijax.sweeps.nodes import Host, nodes_of
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.report import JobsReport
