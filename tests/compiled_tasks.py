@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import jax
 import mujoco
 
-from gmijax.sim import physics
+from gmijax.sim import physics, simulators
 from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import BatchState, StepOutput, env_keys, training_env
 
@@ -59,7 +59,7 @@ class CompiledTask:
 
         Cut off early, as in training, they stop at different places on the way to one answer.
         """
-        mj_model = physics.load(self.env.spec.name, impl="jax", substeps=1).mj_model
+        mj_model = simulators.load(self.env.spec.name, impl="jax", substeps=1).mj_model
         mj_model.opt.iterations = mj_model.opt.ls_iterations = 50
         return physics.from_mj_model(mj_model, impl=self.impl, substeps=1, max_envs=NUM_STARTS)
 

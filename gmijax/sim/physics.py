@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 
 from gmijax.errors import ConfigError
 from gmijax.sim import carried
-from gmijax.sim.impl import ON_GPU, Impl, WarpSizes, choose_impl
+from gmijax.sim.impl import Impl, WarpSizes, choose_impl
 from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
 from gmijax.sim.kinematic_model import kinematic_model
 from gmijax.sim.many_contacts import warn_of_many
 from gmijax.sim.physics_state import PhysicsState
 from gmijax.sim.plain_model import plain
-from gmijax.sim.simulators import load_model
 from gmijax.sim.unsimulated import (
     FULL_NAMES,
     refuse_idle_sensors,
@@ -174,29 +173,6 @@ def mocap_poses(mj_model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[
     return data.mocap_pos.copy(), data.mocap_quat.copy()
 
 
-def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -> Physics:
-    """Loads the model `asset` that is shipped in `gmijax/sim/assets`.
-
-    Args:
-      asset: name of the file without `.xml`.
-      impl: `auto`, `jax` or `warp`.
-      substeps: physics steps per control step.
-      max_envs: upper bound of environments simulated at once, None for no limit.
-
-    Raises:
-      ConfigError: `impl` cannot be had, or the model needs state that is not carried.
-    """
-    mj_model = load_model(asset)
-    chosen, _ = choose_impl(impl, jax.default_backend(), asset)
-    return from_mj_model(
-        mj_model,
-        impl=chosen,
-        substeps=substeps,
-        max_envs=max_envs,
-        warp_sizes=ON_GPU.get(asset),
-    )
-
-
 def from_mj_model(
     mj_model: mujoco.MjModel,
     *,
@@ -205,10 +181,18 @@ def from_mj_model(
     max_envs: int | None = None,
     warp_sizes: WarpSizes | None = None,
 ) -> Physics:
-    """Like `load`, for a model that is already in memory.
+    """A model with its simulator.
 
-    Without `warp_sizes` Warp's buffers hold what the model's geoms can make, up to a number of
-    contacts (`gmijax.sim.warp.sizes`).
+    Args:
+      mj_model: the model.
+      impl: `auto`, `jax` or `warp`.
+      substeps: physics steps per control step.
+      max_envs: upper bound of environments simulated at once, None for no limit.
+      warp_sizes: of Warp's buffers; None: for what the model's geoms can make, up to a number of
+        contacts (`gmijax.sim.warp.sizes`).
+
+    Raises:
+      ConfigError: `impl` cannot be had, or the model needs state that is not carried.
     """
     chosen, _ = choose_impl(impl, jax.default_backend())
     mj_model, name = plain(mj_model), name_of(mj_model)

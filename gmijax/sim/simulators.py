@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
 
+from gmijax.sim.impl import ON_GPU, choose_impl
+
 if TYPE_CHECKING:
     from gmijax.sim.physics import Physics
 
@@ -25,7 +27,7 @@ def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -
 
     Args:
       asset: see `load_model`.
-      impl: `auto`, `jax` or `warp`, see `gmijax.sim.physics.load`; `c`: `gmijax.sim.c_physics`.
+      impl: `auto`, `jax` or `warp`, see `gmijax.sim.impl`; `c`: `gmijax.sim.c_physics`.
       substeps: physics steps per control step.
       max_envs: upper bound of environments simulated at once, None for no limit.
 
@@ -37,6 +39,15 @@ def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -
 
         sim: Any = CPhysics(load_model(asset), substeps)
         return sim
-    from gmijax.sim import physics
+    import jax
 
-    return physics.load(asset, impl=impl, substeps=substeps, max_envs=max_envs)
+    from gmijax.sim.physics import from_mj_model
+
+    chosen, _ = choose_impl(impl, jax.default_backend(), asset)
+    return from_mj_model(
+        load_model(asset),
+        impl=chosen,
+        substeps=substeps,
+        max_envs=max_envs,
+        warp_sizes=ON_GPU.get(asset),
+    )

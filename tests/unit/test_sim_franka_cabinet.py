@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from gmijax.errors import ConfigError
-from gmijax.sim import physics
+from gmijax.sim import physics, simulators
 from gmijax.sim.tasks import franka_cabinet as task
 from gmijax.sim.tasks.settings import FrankaCabinetSettings
 
@@ -21,7 +21,7 @@ HAND_AT_HANDLE = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 @pytest.fixture(scope="module")
 def sim() -> physics.Physics:
-    return physics.load("franka_cabinet", impl="jax", substeps=task.SUBSTEPS)
+    return simulators.load("franka_cabinet", impl="jax", substeps=task.SUBSTEPS)
 
 
 def pose(

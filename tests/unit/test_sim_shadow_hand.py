@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from gmijax.sim import physics, rotations
+from gmijax.sim import physics, rotations, simulators
 from gmijax.sim.interface import Env
 from gmijax.sim.rewards import total_reward
 from gmijax.sim.tasks import shadow_hand
@@ -18,7 +18,7 @@ CUBE = slice(24, 31)
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return physics.load("shadow_hand", impl="jax", substeps=shadow_hand.SUBSTEPS).mj_model
+    return simulators.load("shadow_hand", impl="jax", substeps=shadow_hand.SUBSTEPS).mj_model
 
 
 @pytest.fixture(scope="module")
