@@ -7,7 +7,7 @@ k processes with n environments each see the samples of one process with k x n, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -193,6 +193,35 @@ def overflowed(env: Env, state: EnvState) -> dict[str, Array]:
     return dict(zip(OVERFLOWS, counts, strict=True))
 
 
+def head_starts(spec: EnvSpec, keys: PRNGKey) -> Array:
+    """Steps [N] int32, at random up to a time limit, by which first episodes are shorter."""
+    own = jax.vmap(lambda key: jax.random.fold_in(key, _HEAD_START))(keys)
+    return jax.vmap(lambda key: jax.random.randint(key, (), 0, spec.episode_length))(own)
+
+
+def step_output(
+    env: Env, stepped: EnvState, bad: Mapping[str, Array], finished: EpisodeSums
+) -> StepOutput:
+    """What a step is for the caller.
+
+    Args:
+      env: of which the states are.
+      stepped: the states [N] after it, before any reset.
+      bad: [N] bool, which of them have diverged, by source.
+      finished: see `StepOutput`.
+    """
+    return StepOutput(
+        next_obs=stepped.obs,
+        reward=stepped.reward,
+        terminated=stepped.terminated,
+        truncated=stepped.truncated,
+        is_diverged=bad["any"],
+        finished=finished,
+        diverged={name: jnp.sum(where, dtype=jnp.int32) for name, where in bad.items()},
+        overflowed=overflowed(env, stepped),
+    )
+
+
 def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
     """N auto-resetting copies of `env`, with statistics of the episodes that end.
 
@@ -206,12 +235,6 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
     """
     batched = vectorise(env)
 
-    def head_starts(keys: PRNGKey) -> Array:
-        if not random_ep_len:
-            return jnp.zeros(keys.shape, jnp.int32)
-        own = jax.vmap(lambda key: jax.random.fold_in(key, _HEAD_START))(keys)
-        return jax.vmap(lambda key: jax.random.randint(key, (), 0, env.spec.episode_length))(own)
-
     def init(model: PyTree, keys: PRNGKey) -> BatchState:
         if env.max_envs is not None and len(keys) > env.max_envs:
             raise ConfigError(
@@ -219,7 +242,8 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
             )
         zero = jnp.zeros(keys.shape)
         terms = dict.fromkeys(env.spec.reward_terms, zero)
-        return BatchState(batched.reset(model, keys), zero, terms, head_starts(keys))
+        starts = head_starts(env.spec, keys) if random_ep_len else jnp.zeros(keys.shape, jnp.int32)
+        return BatchState(batched.reset(model, keys), zero, terms, starts)
 
     def advance(model: PyTree, state: BatchState, actions: Array) -> tuple[BatchState, StepOutput]:
         stepped = batched.step(model, state.env, actions)
@@ -231,16 +255,7 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
             kept = select_envs(bad["any"], state.env.task, stepped.task)
             stepped = stepped._replace(task=kept)
         returns, terms, finished = episode_statistics(state, stepped)
-        output = StepOutput(
-            next_obs=stepped.obs,
-            reward=stepped.reward,
-            terminated=stepped.terminated,
-            truncated=stepped.truncated,
-            is_diverged=bad["any"],
-            finished=finished,
-            diverged={name: jnp.sum(where, dtype=jnp.int32) for name, where in bad.items()},
-            overflowed=overflowed(env, stepped),
-        )
+        output = step_output(env, stepped, bad, finished)
         ended = stepped.terminated | stepped.truncated
         head_start = jnp.where(ended, 0, state.head_start)
         return BatchState(stepped, returns, terms, head_start), output

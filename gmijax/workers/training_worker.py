@@ -28,6 +28,7 @@ from gmijax.supervise.job_kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups
 
 if TYPE_CHECKING:
     from gmijax.baselines.tdg_ex import RemoteIteration
+    from gmijax.channels.build import ChannelTopology
     from gmijax.collectives.interface import Communicator
     from gmijax.learning.learner import Learner
     from gmijax.sim.wrappers import BatchedEnv
@@ -165,16 +166,11 @@ def _run_asynchronous(
     agents, trainers = groups_of(plan)
     sizes = num_weights(env.spec, config.algo), num_counts(env)
     registers = open_job_registers(required_fd(ENV_REGISTERS_FD), *sizes, len(agents.gmis))
-    topology, (nodes, listener) = topology_of(plan), inherited_nodes()
+    nodes, listener = inherited_nodes()
     if nodes is not None:
-        addresses = {
-            (agent, trainer): at
-            for (trainer, agent), at in nodes.calls.items()
-            if trainer in trainers.gmis
-        }
-        topology = replace(topology, addresses=addresses, secret=nodes.token)
         at_leader = agents.gmis, trainers.gmis[0], held
         registers = over_nodes(registers, sizes, nodes, link.gmi, *at_leader)
+    topology = _topology(plan, trainers, nodes)
     channels = config.channel, topology, link.gmi, required_fd(ENV_CHANNELS_FD)
     if link.gmi in agents.gmis:
         if listener is not None:
@@ -191,6 +187,19 @@ def _run_asynchronous(
     held.callback(comm.close)
     trainer = Trainer(config, env, agents.gmis, registers, receiver, comm, link)
     return trainer.run() | exchange_used(plan, comm)
+
+
+def _topology(plan: Plan, trainers: Group, nodes: NodeAddresses | None) -> ChannelTopology:
+    """Who sends experience to whom, and to which address on another node."""
+    topology = topology_of(plan)
+    if nodes is None:
+        return topology
+    addresses = {
+        (agent, trainer): at
+        for (trainer, agent), at in nodes.calls.items()
+        if trainer in trainers.gmis
+    }
+    return replace(topology, addresses=addresses, secret=nodes.token)
 
 
 def environments(config: TrainConfig, place: int) -> BatchedEnv:

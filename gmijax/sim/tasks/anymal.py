@@ -138,18 +138,8 @@ def make(
     terms, chosen = with_weights(TERMS, rewards), settings_from(AnymalSettings, settings)
     sim = simulators.load("anymal", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = look_up(sim.mj_model)
-    # A number that is not finite outlives the clipping of observations or shows in `qpos`, so
-    # `max_abs_obs` need not be told.
-    spec = EnvSpec(
-        name="anymal",
-        obs_size=OBS_SIZE,
-        action_size=ACTION_SIZE,
-        control_dt_s=sim.control_dt_s,
-        episode_length=DEFAULT_EPISODE_LENGTH,
-        reward_terms=term_names(terms, FLOOR),
-        metrics=(*METRICS, SHARE) if curriculum else METRICS,
-        obs_terms=OBS_TERMS,
-    )
+    metrics = (*METRICS, SHARE) if curriculum else METRICS
+    spec = make_spec(sim.control_dt_s, term_names(terms, FLOOR), metrics)
 
     def begin(key: PRNGKey, share: Array | None) -> EnvState:
         key, start_key, command_key = draws.split(key, 3)
@@ -183,6 +173,26 @@ def make(
 
     env = sim.env(spec, reset, step)
     return env._replace(next_episode=next_episode) if curriculum else env
+
+
+def make_spec(
+    control_dt_s: float, reward_terms: tuple[str, ...], metrics: tuple[str, ...]
+) -> EnvSpec:
+    """What the task is, whatever moves it.
+
+    A number that is not finite outlives the clipping of observations or shows in `qpos`, so
+    `max_abs_obs` is left open.
+    """
+    return EnvSpec(
+        name="anymal",
+        obs_size=OBS_SIZE,
+        action_size=ACTION_SIZE,
+        control_dt_s=control_dt_s,
+        episode_length=DEFAULT_EPISODE_LENGTH,
+        reward_terms=reward_terms,
+        metrics=metrics,
+        obs_terms=OBS_TERMS,
+    )
 
 
 def look_up(mj_model: mujoco.MjModel) -> AnymalIds:
