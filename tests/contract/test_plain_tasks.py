@@ -59,14 +59,14 @@ def in_jax(task: str, monkeypatch: pytest.MonkeyPatch) -> tuple[Env, list[Any]]:
     signals: list[Any] = []
     plain = PlainEnv(EnvConfig(name=task, episode_length=None))
 
-    class Environment(Recorded):
+    class Watched(Recorded):
         def step(self, model: Any, state: Any, ctrl: Any, *read: Any) -> Any:
             after, (ctrl, found) = super().step(model, state, ctrl, *read)
             signals.append(ctrl)
             return after, found
 
     with monkeypatch.context() as patch:
-        patch.setattr(simulators, "load", lambda *_, **__: Environment(plain.physics))
+        patch.setattr(simulators, "load", lambda *_, **__: Watched(plain.physics))
         module = __import__(TASKS[task], fromlist=["make"])
         return module.make(), signals
 
