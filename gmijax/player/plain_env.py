@@ -58,7 +58,7 @@ class PlainEnv:
       seed: of the episodes' starts, commands and goals.
 
     Attributes:
-      physics: MuJoCo in C, which moves the world.
+      physics: MuJoCo in C, which moves the robot and all else.
       state: of the task, its arrays numpy's.
 
     Raises:

@@ -30,7 +30,7 @@ class Stage:
     """A model, a camera, and an off-screen OpenGL context.
 
     Args:
-      model: a `mujoco.MjModel`, or its file in MuJoCo's binary format; None: an empty world.
+      model: a `mujoco.MjModel`, or its file in MuJoCo's binary format; None: an empty scene.
       size: width and height of a picture, pixels.
       camera: see `gmijax.sim.camera.choose_camera`.
 

@@ -15,7 +15,7 @@ from gmijax.sim.impl import WarpSizes
 from gmijax.sim.warp.batch import MODEL_LEAVES, OVERFLOW, STATE, lay_out
 from gmijax.sim.warp.step import WarpStep
 
-JOBS, WORLDS = 2, 3
+JOBS, ENVS = 2, 3
 SHAPES = {**dict.fromkeys((*STATE, "ctrl"), (2,)), OVERFLOW: (), "sensordata": (4,)}
 
 
@@ -63,19 +63,19 @@ def model_with(body_mass: jax.Array) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("mass_shape", "rows"), [((2,), 1), ((WORLDS, 2), JOBS * WORLDS), ((JOBS, 1, 2), 6)]
+    ("mass_shape", "rows"), [((2,), 1), ((ENVS, 2), JOBS * ENVS), ((JOBS, 1, 2), 6)]
 )
 def test_a_map_over_jobs_and_environments_is_one_call_of_all_environments(
     step: Arithmetic, mass_shape: tuple[int, ...], rows: int
 ):
     rng = np.random.default_rng(0)
-    mass, ctrl = (jnp.array(rng.uniform(size=s), jnp.float32) for s in (mass_shape, (WORLDS, 2)))
-    state = {name: jnp.array(rng.uniform(size=(JOBS, WORLDS, 2)), jnp.float32) for name in STATE}
+    mass, ctrl = (jnp.array(rng.uniform(size=s), jnp.float32) for s in (mass_shape, (ENVS, 2)))
+    state = {name: jnp.array(rng.uniform(size=(JOBS, ENVS, 2)), jnp.float32) for name in STATE}
 
     def one(body_mass: jax.Array, state: Any, ctrl: jax.Array) -> Any:
         return step(model_with(body_mass), state, ctrl, lambda data: data.sensordata[:2])
 
-    of_envs = 0 if mass_shape == (WORLDS, 2) else None
+    of_envs = 0 if mass_shape == (ENVS, 2) else None
     of_jobs = 0 if mass_shape == (JOBS, 1, 2) else None
     mass = mass.reshape(JOBS, 2) if of_jobs == 0 else mass
     mapped = jax.vmap(jax.vmap(one, (of_envs, 0, 0)), (of_jobs, 0, None))
@@ -85,7 +85,7 @@ def test_a_map_over_jobs_and_environments_is_one_call_of_all_environments(
         np.testing.assert_allclose(moved[name], state[name] + ctrl * factor, rtol=1e-6)
     assert moved[OVERFLOW].tolist() == [[0, 1, 2], [3, 4, 5]]
     np.testing.assert_array_equal(reading, state["qpos"])
-    assert step.seen[-1] == (JOBS * WORLDS, {"body_mass": rows})
+    assert step.seen[-1] == (JOBS * ENVS, {"body_mass": rows})
 
 
 def test_a_task_may_read_the_controls(step: Arithmetic):
