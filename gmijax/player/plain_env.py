@@ -58,7 +58,7 @@ class PlainEnv:
       seed: of the episodes' starts, commands and goals.
 
     Attributes:
-      physics: MuJoCo in C, which moves the robot and all else.
+      physics: MuJoCo in C, which simulates the task.
       state: of the task, its arrays numpy's.
 
     Raises:
