@@ -22,14 +22,16 @@ from gmijax.control.console import Show, announce, nearby, open_console, print_n
 from gmijax.control.decide import JobSpec, decide, with_task
 from gmijax.control.films import filmed, find_opengl
 from gmijax.control.progress import ConsoleProgress
-from gmijax.control.restarts import (
-    Attempts,
+from gmijax.control.reduced_plan import with_gpus_left, with_nodes_left
+from gmijax.control.restarts import Attempts
+from gmijax.control.run_folder import (
     clear_unfinished,
     drop_half_written,
-    with_gpus_left,
-    with_nodes_left,
+    opened,
+    record_end,
+    started_from,
+    what_is_left,
 )
-from gmijax.control.run_folder import opened, record_end, started_from, what_is_left
 from gmijax.control.start_point import (
     StartPoint,
     find_start_point,

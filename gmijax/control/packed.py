@@ -21,8 +21,13 @@ from gmijax.config.schema import to_dict
 from gmijax.control.console import announce, open_console
 from gmijax.control.decide import decide
 from gmijax.control.progress import ConsoleProgress
-from gmijax.control.restarts import clear_unfinished, keep_logs
-from gmijax.control.run_folder import opened, record_end, started_from
+from gmijax.control.run_folder import (
+    clear_unfinished,
+    keep_logs,
+    opened,
+    record_end,
+    started_from,
+)
 from gmijax.control.start_point import (
     StartPoint,
     find_start_point,

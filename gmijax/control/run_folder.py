@@ -1,4 +1,4 @@
-"""What a training job does with its run folder, before it starts and after it has ended.
+"""What a training job does with its run folder before, between and after its attempts.
 
 No jax here.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,11 +18,17 @@ from gmijax.control.console import nearby
 from gmijax.control.start_point import StartPoint
 from gmijax.control.summary import train_summary
 from gmijax.partition.plan import Plan
-from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
+from gmijax.runs.folder import RunPaths, add_event, read_json, remove_temporary, write_json
 from gmijax.runs.git import record_git
 from gmijax.runs.held import OpenFolder, locked
-from gmijax.runs.history import draw_returns, read_metrics
-from gmijax.runs.resume import checkpoints_of, drop_unfinished, find_checkpoint
+from gmijax.runs.history import copy_history, draw_returns, read_metrics
+from gmijax.runs.names import attempt_folders, gmi_folders
+from gmijax.runs.resume import (
+    CheckpointMeta,
+    checkpoints_of,
+    drop_unfinished,
+    find_checkpoint,
+)
 from gmijax.runs.saved_config import saved_config
 from gmijax.sim import source
 
@@ -49,6 +56,39 @@ def opened(config: TrainConfig, start_point: StartPoint) -> Iterator[HeldRun]:
     with locked(run.lock, f"run.dir={run.root}") as folder:
         record_git(run, Path.cwd())
         yield HeldRun(run, notes, folder)
+
+
+def keep_logs(run: RunPaths, attempt: int) -> None:
+    """Moves what the GMIs of a failed attempt have left out of the way of the next one's."""
+    for folder in gmi_folders(run.root):
+        kept = folder / f"attempt_{attempt}"
+        files = [path for path in folder.iterdir() if path.is_file()]
+        kept.mkdir(exist_ok=True)
+        for path in files:
+            path.rename(kept / path.name)
+
+
+def drop_half_written(run: RunPaths) -> None:
+    """Removes what a killed process has left of files and checkpoints that it was writing."""
+    gmis = gmi_folders(run.root)
+    attempts = [attempt for gmi in gmis for attempt in attempt_folders(gmi)]
+    for folder in (run.root, *gmis, *attempts):
+        remove_temporary(folder)
+    drop_unfinished(run)
+
+
+def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:
+    """Leaves of a run what belongs to a checkpoint.
+
+    No half-written files, no later metrics, and no results of GMIs, which are to train again.
+    """
+    for gmi in gmi_folders(run.root):
+        (gmi / "result.json").unlink(missing_ok=True)
+    drop_half_written(run)
+    # Written anew from the metrics: event files cannot be cut.
+    shutil.rmtree(run.tensorboard, ignore_errors=True)
+    steps = 0 if checkpoint is None else CheckpointMeta.read(checkpoint).env_steps
+    copy_history(run.metrics, run.metrics, steps)
 
 
 def started_from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
