@@ -1,7 +1,7 @@
 """A role of your own: an evolution strategy (arXiv:1703.03864): `python examples/custom_role.py`.
 
-Every GMI tries other changes of one linear policy, in worlds of its own. All take the mean of
-what they found, so their policies stay equal. Options: task, GMIs, generations.
+Every GMI tries other changes of one linear policy, in environments of its own. All take the mean
+of what they found, so their policies stay equal. Options: task, GMIs, generations.
 """
 
 import sys

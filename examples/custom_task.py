@@ -31,9 +31,9 @@ TERMS = {
 def make(*, impl="auto", max_envs=None, rewards=None) -> Env:
     """The task: observation [5], action [1], 50 steps a second, 500 of them an episode."""
     mj_model = mujoco.MjModel.from_xml_string(MJCF)
-    world = physics.from_mj_model(mj_model, impl=impl, substeps=2, max_envs=max_envs)
+    sim = physics.from_mj_model(mj_model, impl=impl, substeps=2, max_envs=max_envs)
     terms = with_weights(TERMS, rewards)  # As `env.rewards.effort=-0.1` says.
-    spec = EnvSpec("swing_up", 5, 1, world.control_dt_s, 500, term_names(terms))
+    spec = EnvSpec("swing_up", 5, 1, sim.control_dt_s, 500, term_names(terms))
 
     def observe(now):
         return jnp.array([now.qpos[0], jnp.cos(now.qpos[1]), jnp.sin(now.qpos[1]), *now.qvel])
@@ -41,16 +41,16 @@ def make(*, impl="auto", max_envs=None, rewards=None) -> Env:
     def reset(model, key):
         key, draw = jax.random.split(key)
         hanging = jnp.array([0.0, jnp.pi]) + 0.1 * jax.random.normal(draw, (2,))
-        start = world.start(hanging, jnp.zeros(2))
+        start = sim.start(hanging, jnp.zeros(2))
         return episode.begin(spec, start, (), observe(start), key)
 
     def step(model, state, action):
         action = jnp.clip(action, -1.0, 1.0)
-        now, _ = world.step(model, state.physics, action)
+        now, _ = sim.step(model, state.physics, action)
         reward = total_reward(terms, View(now.qpos, action))
         return episode.advance(state, now, (), observe(now), reward, jnp.abs(now.qpos[0]) > 2.2)
 
-    return world.env(spec, reset, step)
+    return sim.env(spec, reset, step)
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ def observe(data: mujoco.MjData) -> np.ndarray:
 
 
 def step(data: mujoco.MjData, action: np.ndarray) -> None:
-    """Moves the position targets of the knees, and the world by one control step."""
+    """Moves the position targets of the knees, and the physics by one control step."""
     change = SPEED * SUBSTEPS * data.model.opt.timestep * action
     low, high = np.array([data.model.joint(knee).range for knee in KNEES]).T
     data.ctrl = np.clip(data.ctrl + change, low, high)

@@ -56,7 +56,7 @@ class Done(NamedTuple):
 
 
 class WouldStart(BaseException):
-    """All checks are behind; the next act would be one on the world."""
+    """All checks are done; what comes next would start something."""
 
 
 def run(command: str, *argv: str, cwd: Path, machine: Machine = CPU) -> Done:

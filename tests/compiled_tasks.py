@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import jax
 import mujoco
 
-from gmijax.sim import physics
+from gmijax.sim import physics, simulators
 from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import BatchState, StepOutput, env_keys, training_env
 
@@ -18,7 +18,7 @@ T = TypeVar("T")
 NUM_ENVS = 8
 EPISODE_LENGTH = 25
 NUM_STARTS = 4
-"""Worlds that `converged_step` is called with: it is compiled once."""
+"""Environments that `converged_step` is called with: it is compiled once."""
 
 
 def on_device(state: T) -> T:
@@ -59,7 +59,7 @@ class CompiledTask:
 
         Cut off early, as in training, they stop at different places on the way to one answer.
         """
-        mj_model = physics.load(self.env.spec.name, impl="jax", substeps=1).mj_model
+        mj_model = simulators.load(self.env.spec.name, impl="jax", substeps=1).mj_model
         mj_model.opt.iterations = mj_model.opt.ls_iterations = 50
         return physics.from_mj_model(mj_model, impl=self.impl, substeps=1, max_envs=NUM_STARTS)
 
@@ -67,7 +67,7 @@ class CompiledTask:
     def converged_step(
         self,
     ) -> Callable[..., tuple[physics.PhysicsState, jax.Array]]:
-        """`(model, state, ctrl) -> (state, sensordata)` of `converged`, of NUM_STARTS worlds."""
+        """`(model, state, ctrl) -> (state, sensordata)` of NUM_STARTS `converged` environments."""
         return jax.jit(jax.vmap(self.converged.step, in_axes=(None, 0, 0)))
 
     @property

@@ -1,8 +1,8 @@
 """How far MJX-Warp and MJX-JAX are apart after some steps of a task: `steps_of_both.py TASK`.
 
-Writes the entries of observation and reward whose difference, in the median over worlds, is more
-than a hundredth of their largest value. In single worlds a contact or a joint's limit may begin a
-step apart, with differences at once.
+Writes the entries of observation and reward whose difference, in the median over environments, is
+more than a hundredth of their largest value. In single environments a contact or a joint's limit
+may begin a step apart, with differences at once.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import numpy as np
 
 from gmijax.sim.registry import make_env
 
-NUM_WORLDS, NUM_STEPS = 128, 3
+NUM_ENVS, NUM_STEPS = 128, 3
 
 
 def after_steps(task: str, impl: str) -> dict[str, Any]:
     """Observation and reward [N, ...] after steps with small random actions."""
-    env = make_env(task, impl=impl, max_envs=NUM_WORLDS)
-    shape = (NUM_STEPS, NUM_WORLDS, env.spec.action_size)
+    env = make_env(task, impl=impl, max_envs=NUM_ENVS)
+    shape = (NUM_STEPS, NUM_ENVS, env.spec.action_size)
     actions = jax.random.uniform(jax.random.key(3), shape, minval=-0.25, maxval=0.25)
-    keys = jax.random.split(jax.random.key(1), NUM_WORLDS)
+    keys = jax.random.split(jax.random.key(1), NUM_ENVS)
     state = jax.jit(jax.vmap(env.reset, (None, 0)))(env.model, keys)
     step = jax.jit(jax.vmap(env.step, (None, 0, 0)))
     for action in actions:

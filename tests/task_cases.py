@@ -26,8 +26,8 @@ class TaskCase(NamedTuple):
     """One task.
 
     Attributes:
-      hazard: where in `qpos` [nq] a world is moved so that the next step ends the episode, and
-        the numbers there; None for a task that only time ends.
+      hazard: where in `qpos` [nq] an environment is moved so that the next step ends the episode,
+        and the numbers there; None for a task that only time ends.
       oracle: how near to C MuJoCo one physics step must be.
       energy_gain: what a passive robot may gain, as a fraction of the most that it has in motion.
       penetration_m: how deep random actions may press two bodies into each other, metres.

@@ -17,7 +17,7 @@ from gmijax.sim.wrappers import BatchedEnv, training_env
 
 
 def point_mass(episode_length: int = 20) -> BatchedEnv:
-    """Many worlds of `point_mass_env`."""
+    """Many environments of `point_mass_env`."""
     return training_env(point_mass_env(episode_length))
 
 
@@ -56,7 +56,7 @@ def walker(episode_length: int = 100, *, carries: bool = False) -> Env:
     """One unit per step from a random start in [0, 1); it falls over at 3 or more.
 
     The reward is 1 for walking plus 10 times the action. With `carries` a level grows by one with
-    every episode that runs out of time. An action above 1 breaks the world, and its level.
+    every episode that runs out of time. An action above 1 breaks the environment, and its level.
     """
     spec = EnvSpec("walker", 1, 1, 1.0, 100, ("walk", "push"), metrics=("level",))
 

@@ -80,7 +80,7 @@ def environment(training: BraxTraining) -> tuple[Any, dict[str, Any]]:
     """The environment without wrappers, and what `train` must be told because of it."""
     length = training.arguments["episode_length"]
     if training.suite == "gmijax":
-        # Worlds of MJX-Warp share buffers that are made for so many.
+        # Environments of MJX-Warp share buffers that are made for so many.
         envs = training.arguments["num_envs"]
         env = make_env(training.env, impl=training.impl, api="brax", max_envs=envs)
         return env, {"episode_length": length or env.episode_length}

@@ -108,10 +108,6 @@ class Connection:
             raise error
         return None
 
-    def is_up(self) -> bool:
-        """Whether there is a connection."""
-        return self._was_up and not self._has_ended
-
     def is_cut(self) -> bool:
         """Whether there was a connection and is none now, and all has been received."""
         return self._was_up and self._has_ended and not self._incoming

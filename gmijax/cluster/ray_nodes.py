@@ -96,25 +96,29 @@ class RayCluster:
         least = max(1, least or wanted or 1)
         while True:
             gpus = self._gpus_of_nodes(num_cpus, least_gpus, most_gpus)
-            found = len(gpus)
             is_over = running_s() >= deadline_s
-            if found >= (wanted or 1) or (is_over and found >= least):
+            if len(gpus) >= (wanted or 1) or (is_over and len(gpus) >= least):
                 break
             if is_over:
-                some_gpus = " and a GPU" if any(gpus) or least_gpus else ""
-                some_gpus = f" and {least_gpus} GPUs" if least_gpus > 1 else some_gpus
-                raise ConfigError(
-                    f"cluster.nodes={wanted or 'auto'}: the cluster has {found} nodes with "
-                    f"{num_cpus} CPUs{some_gpus}, and no more came within "
-                    f"cluster.wait_s={self._config.wait_s:g} s"
-                )
+                raise self._too_few(gpus, wanted, num_cpus, least_gpus)
             if is_unwanted():
                 raise JobInterrupted("stopped while it waited for nodes")
             time.sleep(_POLL_S)
-        num_nodes = min(found, wanted or found)
+        num_nodes = min(len(gpus), wanted or len(gpus))
         bundle = {"CPU": num_cpus} | ({"GPU": few} if (few := gpus[num_nodes - 1]) else {})
         self._place(bundle, num_nodes, deadline_s)
         return self._joined()
+
+    def _too_few(
+        self, gpus: list[int], wanted: int | None, num_cpus: float, least_gpus: int
+    ) -> ConfigError:
+        some_gpus = " and a GPU" if any(gpus) or least_gpus else ""
+        some_gpus = f" and {least_gpus} GPUs" if least_gpus > 1 else some_gpus
+        return ConfigError(
+            f"cluster.nodes={wanted or 'auto'}: the cluster has {len(gpus)} nodes with "
+            f"{num_cpus} CPUs{some_gpus}, and no more came within "
+            f"cluster.wait_s={self._config.wait_s:g} s"
+        )
 
     @property
     def has_gpus(self) -> bool:

@@ -84,7 +84,7 @@ def collect(context: CollectorContext, plan: Plan) -> dict[str, Any]:
     """Makes the unrolls of a GMI of the plan; the outcome for `result.json`.
 
     Raises:
-      NonFiniteError: too many worlds gave numbers that are not finite or beyond all bounds.
+      NonFiniteError: too many environments gave numbers that are not finite or beyond all bounds.
       CollectiveError: another GMI is gone or stuck before all have begun.
     """
     del plan

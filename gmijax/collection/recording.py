@@ -109,7 +109,8 @@ class CollectionStats:
         """Waits for an unroll and takes it in.
 
         Raises:
-          NonFiniteError: too many worlds gave numbers that are not finite or beyond all bounds.
+          NonFiniteError: too many environments gave numbers that are not finite or beyond all
+            bounds.
         """
         host: Any = jax.tree.map(float, jax.device_get(counts))
         now_s = time.monotonic()

@@ -77,17 +77,26 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Reduc
     if strategy == "one_shot":
         return [ReductionStage("all_gather", "ipc", everyone)]
     rings = tuple(zip(*gpus, strict=True)) if is_even(layout) else ()
-    if strategy == "mrr":
-        if len(rings) == 1:
-            return [ReductionStage("all_reduce", "ring", rings)]
-        # Ring k ends on GPU k: the ends are on different GPUs, as NCCL asks.
-        ends = tuple(ring[index] for index, ring in enumerate(rings))
-        back = tuple(_first(end, ring) for end, ring in zip(ends, rings, strict=True))
-        return [
-            ReductionStage("all_reduce", "ring", rings),
-            ReductionStage("all_reduce", "ring", (ends,)),
-            ReductionStage("broadcast", "ring", back),
-        ]
+    return _multi_ring(rings) if strategy == "mrr" else _hierarchical(layout, rings, intra)
+
+
+def _multi_ring(rings: Groups) -> Sequence[ReductionStage]:
+    """`mrr` with these rings, one for every index on a GPU."""
+    if len(rings) == 1:
+        return [ReductionStage("all_reduce", "ring", rings)]
+    # Ring k ends on GPU k: the ends are on different GPUs, as NCCL asks.
+    ends = tuple(ring[index] for index, ring in enumerate(rings))
+    back = tuple(_first(end, ring) for end, ring in zip(ends, rings, strict=True))
+    return [
+        ReductionStage("all_reduce", "ring", rings),
+        ReductionStage("all_reduce", "ring", (ends,)),
+        ReductionStage("broadcast", "ring", back),
+    ]
+
+
+def _hierarchical(layout: Layout, rings: Groups, intra: str) -> Sequence[ReductionStage]:
+    """`har`; `rings` are those of `mrr`, none where GPUs have different numbers of GMIs."""
+    gpus = layout.gmis_of_gpu
     inner: TransportName = "ipc" if intra == "ipc" else "host"
     led = tuple(_first(leader, gpu) for leader, gpu in zip(leaders(layout), gpus, strict=True))
     inside = ReductionStage("all_gather" if inner == "ipc" else "all_reduce", inner, led)

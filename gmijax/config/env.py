@@ -1,4 +1,4 @@
-"""The task, what of its model may be drawn for every world, and its simulator."""
+"""The task, what of its model may be drawn for every environment, and its simulator."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ RANDOMIZED_LEAVES: Mapping[str, str] = MappingProxyType(
         "actuator_gainprm": "actuators",
     }
 )
-"""Leaves of the physics model that may differ from world to world, and what their names name."""
+"""Leaves of the physics model that may differ between environments, and what their names name."""
 
 NEVER_ZERO = ("body_mass", "geom_friction", "pair_friction")
 """Leaves that MJX divides by."""

@@ -6,12 +6,9 @@ enters the backend, runs the GMIs, and writes the summary however the job ends.
 
 from __future__ import annotations
 
-import dataclasses
 import os
-import shlex
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,12 +22,15 @@ from gmijax.control.console import Show, announce, nearby, open_console, print_n
 from gmijax.control.decide import JobSpec, decide, with_task
 from gmijax.control.films import filmed, find_opengl
 from gmijax.control.progress import ConsoleProgress
-from gmijax.control.restarts import (
-    Attempts,
+from gmijax.control.reduced_plan import with_gpus_left, with_nodes_left
+from gmijax.control.restarts import Attempts
+from gmijax.control.run_folder import (
     clear_unfinished,
     drop_half_written,
-    with_gpus_left,
-    with_nodes_left,
+    opened,
+    record_end,
+    started_from,
+    what_is_left,
 )
 from gmijax.control.start_point import (
     StartPoint,
@@ -46,16 +46,11 @@ from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.compile_times import CompileTime
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
-from gmijax.runs.git import record_git
-from gmijax.runs.held import OpenFolder, is_locked, locked
-from gmijax.runs.history import MetricsReader, copy_history, draw_returns, read_metrics
+from gmijax.runs.held import OpenFolder, is_locked
+from gmijax.runs.history import MetricsReader, copy_history
 from gmijax.runs.resume import (
     CheckpointMeta,
-    checkpoints_of,
-    drop_unfinished,
-    find_checkpoint,
 )
-from gmijax.runs.saved_config import saved_config
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import training_kind
 from gmijax.supervise.run_gmis import Launch, recorded
@@ -136,31 +131,6 @@ def _train(
     return Result(run.root, summary)
 
 
-class HeldRun(NamedTuple):
-    """A run folder that a job holds."""
-
-    run: RunPaths
-    notes: Sequence[str]  # What the user should know of it.
-    folder: OpenFolder  # To see whether it is still there.
-
-
-@contextmanager
-def opened(config: TrainConfig, start_point: StartPoint) -> Iterator[HeldRun]:
-    """The run folder of a job, held while it is entered.
-
-    Raises:
-      ConfigError: as `StartPoint.open` and `locked`.
-    """
-    notes = start_point.notes
-    if start_point.checkpoint is not None:
-        changed = source.changes(config.env, saved_config(start_point.checkpoint)["env"])
-        notes = notes if changed is None else (changed, *notes)
-    run = start_point.open(config)
-    with locked(run.lock, f"run.dir={run.root}") as folder:
-        record_git(run, Path.cwd())
-        yield HeldRun(run, notes, folder)
-
-
 class _TrainingJob:
     """A training job that is ready to start."""
 
@@ -210,7 +180,7 @@ class _TrainingJob:
         with (
             followed(config, run, start_point.checkpoint, self._console.print),
             filmed(self._opengl, run, self._console.print),
-            recorded(run, partial(_what_is_left, run), record),
+            recorded(run, partial(what_is_left, run), record),
         ):
             self._prepare(start_point)
             with progress:
@@ -272,36 +242,6 @@ def _programs_of(config: TrainConfig, plan: Plan, machine: Machine) -> dict[str,
     }
 
 
-def record_end(
-    config: TrainConfig,
-    plan: Plan,
-    run: RunPaths,
-    status: str,
-    wall_s: float,
-    restarts: Sequence[Mapping[str, Any]],
-) -> None:
-    """Leaves in the run folder how a run has ended; arguments as of `train_summary`."""
-    add_event(run.events, status)
-    drop_unfinished(run)  # On a full disk they stand in the way of the summary.
-    write_json(run.summary, train_summary(config, plan, run, status, wall_s, restarts))
-    with suppress(OSError):  # What counts is written.
-        draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
-
-
-def started_from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
-    """The configuration with `run.resume` as the path of a checkpoint, or null.
-
-    What else it takes from other runs is the path of a checkpoint from then on too, so that all
-    GMIs, restarts and resumed runs take the same.
-
-    Raises:
-      ConfigError: there is no such checkpoint.
-    """
-    resume = None if checkpoint is None else str(checkpoint)
-    run = dataclasses.replace(config.run, resume=resume)
-    return dataclasses.replace(config, run=run, algo=config.algo.with_checkpoints(find_checkpoint))
-
-
 def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
     """Result of a run that is complete; writes the summary if it is missing."""
     if not is_locked(run.lock):
@@ -317,14 +257,3 @@ def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
     console.print(f"nothing is left to do: {nearby(run.root)}")
     print_next(console, *next_steps(run))
     return Result(run.root, summary)
-
-
-def _what_is_left(run: RunPaths) -> str:
-    """Says how an interrupted job can be continued."""
-    if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
-        return f"training was complete: {nearby(run.root)}"
-    if checkpoints_of(run.root):
-        return f"continue: gmijax train run.dir={shlex.quote(nearby(run.root))} run.resume=auto"
-    if not read_metrics(run.metrics):
-        return "training had not begun, so there is no checkpoint"
-    return "there is no checkpoint: run.stop_timeout_s is the time that GMIs get to save one"

@@ -16,14 +16,20 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from gmijax.config import TrainConfig
+from gmijax.config import PhysicsConfig, TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import announce, open_console
 from gmijax.control.decide import decide
-from gmijax.control.job import opened, record_end, started_from
 from gmijax.control.progress import ConsoleProgress
-from gmijax.control.restarts import clear_unfinished, keep_logs
+from gmijax.control.run_folder import (
+    clear_unfinished,
+    keep_logs,
+    opened,
+    record_end,
+    started_from,
+)
 from gmijax.control.start_point import (
+    StartPoint,
     find_start_point,
     forgotten,
     replay_line,
@@ -44,6 +50,7 @@ class _Member(NamedTuple):
 
     config: TrainConfig
     run: RunPaths
+    folder: OpenFolder
 
 
 def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = False) -> None:
@@ -70,59 +77,66 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
         require_replay_fits(config, plan, start_point.checkpoint)
     gmis = RunPaths(folder)
     with ExitStack() as held:
-        members: list[_Member] = []
-        folders: list[OpenFolder] = []
         notes = [*reasons, *replay_line(config, plan)]
+        members: list[_Member] = []
         for own, start_point in zip(configs, start_points, strict=True):
-            run, changes, its_folder = held.enter_context(opened(own, start_point))
-            folders.append(its_folder)
-            own = dataclasses.replace(own, physics=config.physics)
-            members.append(_Member(started_from(own, start_point.checkpoint), run))
-            notes += (*changes, *filter(None, [forgotten(members[-1].config, plan)]))
-            if start_point.folder is not None:
-                clear_unfinished(run, start_point.checkpoint)
+            member, changes = _open(own, config.physics, start_point, held)
+            members.append(member)
+            notes += (*changes, *filter(None, [forgotten(member.config, plan)]))
         what = f"{len(members)} runs of {plan.num_envs_per_gmi} environments in one program"
         announce(console, gmis, plan, what, tuple(dict.fromkeys(notes)))
-        keep_logs(gmis, len(list(gmis.root.glob("gmi_0/attempt_*"))))
-        write_json(gmis.plan, plan.to_dict())
-        for member in members:
-            _prepare(member, plan, gmis)
+        _prepare(members, plan, gmis)
+        roots = json.dumps([str(member.run.root) for member in members])
         launch = Launch(
             plan=plan,
             machine=machine,
             run=gmis,
             kind=PACKED,
             timeouts=config.run,
-            variables={MEMBERS_VARIABLE: json.dumps([str(run.root) for _, run in members])},
+            variables={MEMBERS_VARIABLE: roots},
             on_warning=console.print,
         )
         new = MetricsReader(members[0].run.metrics).new
         progress = ConsoleProgress(console, new, config.num_timesteps)
 
         def on_tick(status: tuple[GmiStatus, ...]) -> None:
-            for one in folders:
-                one.require()
+            for member in members:
+                member.folder.require()
             progress.update(status)
 
         record = partial(_record, members, started_s)
         with recorded(gmis, lambda: "continue with the same sweep", record), progress:
             run_gmis(launch, on_tick)
-        for _, run in members:
-            console.print(train_outcome(read_json(run.summary), run))
+        for member in members:
+            console.print(train_outcome(read_json(member.run.summary), member.run))
 
 
-def _prepare(member: _Member, plan: Plan, gmis: RunPaths) -> None:
-    config, run = member
-    run.gmi(0).root.mkdir(exist_ok=True)
-    run.gmi(0).error.unlink(missing_ok=True)
-    write_json(run.config, to_dict(config))
-    write_json(run.plan, plan.to_dict())
-    add_event(run.events, "start", checkpoint=config.run.resume, gmi=str(gmis.gmi(0).root))
+def _open(
+    config: TrainConfig, physics: PhysicsConfig, start_point: StartPoint, held: ExitStack
+) -> tuple[_Member, Sequence[str]]:
+    """One of the runs with its folder, which is held, and what differs from its saved keys."""
+    run, changes, folder = held.enter_context(opened(config, start_point))
+    if start_point.folder is not None:
+        clear_unfinished(run, start_point.checkpoint)
+    config = dataclasses.replace(config, physics=physics)
+    return _Member(started_from(config, start_point.checkpoint), run, folder), changes
+
+
+def _prepare(members: Sequence[_Member], plan: Plan, gmis: RunPaths) -> None:
+    """Writes what the GMI reads when it starts; keeps the logs of the one before."""
+    keep_logs(gmis, len(list(gmis.root.glob("gmi_0/attempt_*"))))
+    write_json(gmis.plan, plan.to_dict())
+    for config, run, _ in members:
+        run.gmi(0).root.mkdir(exist_ok=True)
+        run.gmi(0).error.unlink(missing_ok=True)
+        write_json(run.config, to_dict(config))
+        write_json(run.plan, plan.to_dict())
+        add_event(run.events, "start", checkpoint=config.run.resume, gmi=str(gmis.gmi(0).root))
 
 
 def _record(members: Sequence[_Member], started_s: float, status: str, plan: Plan) -> None:
     wall_s = time.monotonic() - started_s
-    for config, run in members:
+    for config, run, _ in members:
         if not run.config.exists():
             continue  # Its folder is gone.
         write_json(run.plan, plan.to_dict())

@@ -7,27 +7,20 @@ once.
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import os
 import re
-import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gmijax.config import PlanConfig, TrainConfig
+from gmijax.control.run_folder import clear_unfinished, keep_logs
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, JobInterrupted
-from gmijax.machine.snapshot import Machine
-from gmijax.partition.plan import Plan
-from gmijax.runs.folder import RunPaths, add_event, remove_temporary
-from gmijax.runs.history import copy_history
-from gmijax.runs.names import attempt_folders, gmi_folders
-from gmijax.runs.resume import CheckpointMeta, drop_unfinished, newest_checkpoint
-from gmijax.supervise.job_kinds import training_plan
+from gmijax.runs.folder import RunPaths, add_event
+from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
 from gmijax.supervise.run_gmis import Launch, OnTick, StopSignals, run_gmis, stop_signals
 from gmijax.supervise.watched_gmi import GmiStatus
 
@@ -193,109 +186,6 @@ def why_not_again(error: GmiFailed, last: GmiFailed | None) -> str | None:
         if same == (last.iteration, last.error.type, _frames(last.error.traceback)):
             return f"the same error at the same iteration ({error.iteration}) twice"
     return None
-
-
-def keep_logs(run: RunPaths, attempt: int) -> None:
-    """Moves what the GMIs of a failed attempt have left out of the way of the next one's."""
-    for folder in gmi_folders(run.root):
-        kept = folder / f"attempt_{attempt}"
-        files = [path for path in folder.iterdir() if path.is_file()]
-        kept.mkdir(exist_ok=True)
-        for path in files:
-            path.rename(kept / path.name)
-
-
-def drop_half_written(run: RunPaths) -> None:
-    """Removes what a killed process has left of files and checkpoints that it was writing."""
-    gmis = gmi_folders(run.root)
-    attempts = [attempt for gmi in gmis for attempt in attempt_folders(gmi)]
-    for folder in (run.root, *gmis, *attempts):
-        remove_temporary(folder)
-    drop_unfinished(run)
-
-
-def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:
-    """Leaves of a run what belongs to a checkpoint.
-
-    No half-written files, no later metrics, and no results of GMIs, which are to train again.
-    """
-    for gmi in gmi_folders(run.root):
-        (gmi / "result.json").unlink(missing_ok=True)
-    drop_half_written(run)
-    # Written anew from the metrics: event files cannot be cut.
-    shutil.rmtree(run.tensorboard, ignore_errors=True)
-    copy_history(run.metrics, run.metrics, max(0, _steps(checkpoint)))
-
-
-def with_gpus_left(
-    config: TrainConfig, plan: Plan, machine: Machine
-) -> tuple[TrainConfig, Plan, tuple[str, ...]]:
-    """The job as it can go on, with Algorithm 1 decided again where GPUs are gone.
-
-    Every GMI keeps its number of environments, so there are fewer of them in all.
-
-    Returns:
-      Configuration and plan, both as they were where no GPU is gone, and sentences for the user.
-
-    Raises:
-      ConfigError: GPUs are gone, and the job may not or cannot go on with those that are left.
-    """
-    lost = _lost(plan, machine)
-    if not lost:
-        return config, plan, ()
-    num_left = plan.layout.num_gpus - len(lost)
-    gone = f"GPUs {sorted(lost)} of the job are gone"
-    if not config.run.elastic:
-        raise ConfigError(f"{gone}; run.elastic=true would go on with the {num_left} left")
-    if num_left == 0:
-        raise ConfigError(f"{gone}, and no other one is left")
-    if config.is_decoupled and config.plan.serving_gpus is not None:
-        raise ConfigError(f"{gone}; plan.serving_gpus and plan.training_gpus name them")
-    config = dataclasses.replace(config, plan=_without(config, plan, machine, lost))
-    shrunk = training_plan(config, machine)
-    note = (
-        f"{gone}: continuing with {num_left}, layout {shrunk.layout}, "
-        f"reduction {shrunk.strategy}; {shrunk.num_envs_per_gmi} environments per GMI as before"
-    )
-    return config, dataclasses.replace(shrunk, reasons=(*shrunk.reasons, note)), (note,)
-
-
-def with_nodes_left(
-    config: TrainConfig, plan: Plan, nodes: Mapping[str, Machine]
-) -> tuple[Plan, tuple[str, ...]]:
-    """The plan for the nodes that a job has now, and sentences for the user if they are fewer."""
-    again = training_plan(config, next(iter(nodes.values())), nodes=nodes)
-    num_lost = len(plan.nodes) - len(nodes)
-    if not num_lost:
-        return again, ()
-    note = (
-        f"{num_lost} nodes of the job are gone: continuing with {len(nodes)}, layout "
-        f"{again.layout}; {again.num_envs_per_gmi} environments per GMI as before"
-    )
-    return dataclasses.replace(again, reasons=(*again.reasons, note)), (note,)
-
-
-def _lost(plan: Plan, machine: Machine) -> set[int]:
-    """Positions in the job of the GPUs that the machine no longer has."""
-    if plan.backend == "cpu":
-        return set()
-    present = {gpu.uuid for gpu in machine.gpus}
-    present |= {one.uuid for gpu in machine.gpus for one in gpu.instances}
-    return {allocation.gpu for allocation in plan.allocations if allocation.device not in present}
-
-
-def _without(config: TrainConfig, plan: Plan, machine: Machine, lost: set[int]) -> PlanConfig:
-    """The user's wishes for the GPUs that are left, which keep their indices."""
-    kept = [position for position in range(plan.layout.num_gpus) if position not in lost]
-    index_of = {gpu.uuid: gpu.index for gpu in machine.gpus}
-    index_of |= {one.uuid: gpu.index for gpu in machine.gpus for one in gpu.instances}
-    device_of = {allocation.gpu: allocation.device for allocation in plan.allocations}
-    gpus = tuple(index_of[device_of[position]] for position in kept)
-    rows = config.plan.layout
-    if rows is not None:
-        new_ids = {old: new for new, old in enumerate(sorted(i for p in kept for i in rows[p]))}
-        rows = tuple(tuple(new_ids[i] for i in rows[position]) for position in kept)
-    return dataclasses.replace(config.plan, gpus=gpus, layout=rows)
 
 
 def _about(error: GmiFailed) -> dict[str, Any]:

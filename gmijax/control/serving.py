@@ -24,7 +24,7 @@ from gmijax.config.schema import to_dict
 from gmijax.control.console import Show, announce, nearby, open_console, print_next
 from gmijax.control.decide import decide, with_task
 from gmijax.control.progress import ConsoleProgress
-from gmijax.control.summary import serve_outcome, serve_summary
+from gmijax.control.serve_summary import serve_outcome, serve_summary
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan

@@ -189,7 +189,7 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
 
 
 def _memory_of(env: EnvConfig) -> dict[str, object]:
-    """The keys on which it depends what worlds remember, and so what a checkpoint has of them."""
+    """The keys that decide what environments remember, and so what a checkpoint has of them."""
     return {
         "history": env.history,
         "action_repeat": env.action_repeat,

@@ -14,7 +14,7 @@ from typing import Final
 
 from gmijax.config import ExportConfig, PlanConfig, ReduceConfig, Timeouts
 from gmijax.control.console import Show, doing, nearby, open_console, print_next
-from gmijax.deploy.playing import open_run, output_folder
+from gmijax.deploy.trained_run import open_run, output_folder
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.planner import make_plan

@@ -47,7 +47,7 @@ def stablehlo_content(policy: TrainedPolicy) -> bytes:
 
     With a digest at its end, see `gmijax.deploy.sealed`.
     """
-    (num_worlds,) = jax.export.symbolic_shape("N")
-    obs = jax.ShapeDtypeStruct((num_worlds, policy.obs_size), jnp.float32)
+    (num_envs,) = jax.export.symbolic_shape("N")
+    obs = jax.ShapeDtypeStruct((num_envs, policy.obs_size), jnp.float32)
     exported = jax.export.export(jax.jit(policy.act), platforms=_PLATFORMS)(obs)
     return sealed(bytes(exported.serialize()))

@@ -6,61 +6,42 @@ as the one GMI of a small plan, `gmijax.workers.play_film` films them.
 
 from __future__ import annotations
 
-import dataclasses
-import os
 import shlex
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from rich.console import Console
 from rich.table import Table
 
 from gmijax.config import (
-    EnvConfig,
-    ExportConfig,
     PlanConfig,
     PlayConfig,
     ReduceConfig,
     Timeouts,
-    ViewConfig,
 )
-from gmijax.config.schema import to_dict
 from gmijax.control.console import Show, doing, nearby, open_console, print_next
 from gmijax.control.summary import EXPLORING
 from gmijax.deploy import shipped
 from gmijax.deploy.pictures import film, write_page
 from gmijax.deploy.shipped import SHIPPED
+from gmijax.deploy.trained_run import open_run, output_folder
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
 from gmijax.player.joystick import robot_of
 from gmijax.player.walking import ONE_ACTION, lines_of
 from gmijax.runs.folder import (
-    META,
     PlayPaths,
     RunPaths,
     read_json,
-    remove_temporary,
-    write_json,
 )
 from gmijax.runs.history import read_metrics
-from gmijax.runs.names import steps_name
-from gmijax.runs.resume import (
-    CheckpointMeta,
-    best_checkpoint,
-    checkpoints_of,
-    find_checkpoint,
-    rank_of,
-)
-from gmijax.runs.saved_config import left_out, trained_config
-from gmijax.sim import source
-from gmijax.sim.registry import TASKS, draws_models, require_env
+from gmijax.runs.saved_config import trained_config
+from gmijax.sim.registry import TASKS, draws_models
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.run_gmis import Launch, run_gmis
 from gmijax.viewer.installed import INSTALL, missing
-
-C = TypeVar("C", PlayConfig, ExportConfig, ViewConfig)
 
 MEMORY_FRACTION: Final = 0.1
 """Most of a GPU's memory that playing takes: beside a training job that reserves 0.8."""
@@ -68,9 +49,6 @@ MEMORY_FRACTION: Final = 0.1
 _TIMEOUTS: Final = Timeouts(
     start_timeout_s=1200.0, stall_timeout_s=600.0, stop_timeout_s=60.0, grace_s=10.0
 )
-
-_MOST_DIGITS: Final = 18
-"""Of env steps; a longer number is no file name."""
 
 
 def play(config: PlayConfig, *, show: Show = False) -> None:
@@ -183,105 +161,6 @@ def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
         if env.action_repeat != 1:
             raise ConfigError(f"{asked}: env.action_repeat={env.action_repeat}; {ONE_ACTION}")
     return config, changed
-
-
-def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
-    """Finds and checks the checkpoint, run and task of a configuration.
-
-    All before a process is started, which would find them bad too.
-
-    Returns:
-      The configuration with what was found, the task, and what the user should know before it is
-      executed, also what is not as the run had it (None if nothing).
-
-    Raises:
-      ConfigError: no such run or checkpoint, or its task cannot be had.
-    """
-    if config.run.env is not None and ".py" not in config.run.env:
-        hint = f"; add checkpoint={SHIPPED} for the policy that comes with gmijax"
-        why = "a run knows its task" + ("" if isinstance(config, ExportConfig) else hint)
-        raise ConfigError(f"env={config.run.env}: {why}")
-    checkpoint = checkpoint_of(config)
-    early = None
-    if config.checkpoint == "best" and not rank_of(checkpoint).is_full:
-        early = (
-            "checkpoint=best: none has an evaluation or a full window of episodes to compare by"
-        )
-    saved, _ = trained_config(checkpoint)
-    env = source.opened(saved, config.run.env)
-    require_env(env)
-    run = dataclasses.replace(config.run, dir=str(checkpoint.parents[1]))
-    if env.suite == "custom":
-        run = dataclasses.replace(run, env=env.name, env_sha256=env.source_sha256)
-    config = dataclasses.replace(config, checkpoint=str(checkpoint), run=run)
-    notes = (
-        source.executed(env),
-        source.changes(env, dataclasses.asdict(saved)),
-        left_out(checkpoint),
-        early,
-    )
-    return config, env, "\n".join(filter(None, notes)) or None
-
-
-def checkpoint_of(config: PlayConfig | ExportConfig | ViewConfig) -> Path:
-    """The checkpoint that the configuration names."""
-    wanted, run_dir = config.checkpoint, config.run.dir
-    if wanted in (None, "best") or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):
-        latest = find_checkpoint(run_dir or "last", "run.dir")
-        if wanted == "best":
-            return best_checkpoint(latest.parents[1]) or latest
-        return latest if wanted is None else _at_step(latest.parents[1], int(wanted))
-    if not os.path.isfile(Path(wanted) / META):  # Unlike `Path.is_file` it takes any text.
-        raise ConfigError(
-            f"checkpoint={wanted}: expected the folder of a checkpoint, its env steps, or best"
-        )
-    checkpoint = Path(wanted).resolve()
-    if run_dir is not None:
-        latest = find_checkpoint(run_dir, "run.dir")
-        if latest.parents[1] != checkpoint.parents[1]:
-            raise ConfigError(
-                f"checkpoint={wanted}: not of run.dir={run_dir}; leave out one of them"
-            )
-    return checkpoint
-
-
-def _at_step(run: Path, env_steps: int) -> Path:
-    checkpoint = RunPaths(run).checkpoint(env_steps)
-    if not (checkpoint / META).is_file():
-        steps = ", ".join(str(int(path.name)) for path in checkpoints_of(run))
-        raise ConfigError(
-            f"checkpoint={env_steps}: no such checkpoint in {run}; there are {steps}"
-        )
-    return checkpoint
-
-
-def output_folder(
-    config: PlayConfig | ExportConfig,
-    name: str,
-    stale: Callable[[Path], Iterable[Path]] = lambda _: (),
-) -> Path:
-    """Where what is made of a checkpoint goes: `<run>/<name>/<env steps>`, with the configuration.
-
-    Args:
-      config: with what `open_run` found.
-      name: see above.
-      stale: files that may be there from before, in such a folder; they are removed.
-
-    Raises:
-      ConfigError: it cannot be written.
-    """
-    run = Path(str(config.run.dir))
-    env_steps = CheckpointMeta.read(Path(str(config.checkpoint))).env_steps
-    root = run / name / steps_name(env_steps)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        write_json(RunPaths(root).config, to_dict(config))
-        remove_temporary(root)
-        for path in stale(root):
-            path.unlink(missing_ok=True)
-    except OSError as error:
-        raise ConfigError(f"run.dir={run}: cannot write to {root} ({error.strerror})") from None
-    return root
 
 
 def launch_of(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:

@@ -14,8 +14,8 @@ from rich.console import Console
 
 from gmijax.config import EnvConfig, ViewConfig
 from gmijax.control.console import nearby, open_console
-from gmijax.deploy.playing import open_run
 from gmijax.deploy.shipped import SHIPPED
+from gmijax.deploy.trained_run import open_run
 from gmijax.errors import ConfigError
 from gmijax.player.plain_env import PlainEnv, task_of
 from gmijax.player.policy import PlainPolicy, checkpoint_policy

@@ -1,4 +1,4 @@
-"""Checkpoints of the full state, written with orbax.
+"""Checkpoints of the full state: their parts, when they are complete, and which of them stay.
 
 `<run>/checkpoints/<12-digit env steps>/{learner,gmi_0,gmi_1,...,meta.json}`: what all GMIs share
 is written by the leader, each GMI's environments, and its replay if asked, by itself. Everything
@@ -14,20 +14,18 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 
 from gmijax.collectives.interface import Communicator
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
-from gmijax.errors import ConfigError, GmijaxError, NonFiniteError, ParameterMismatch, lines_of
+from gmijax.errors import ConfigError, NonFiniteError, ParameterMismatch
+from gmijax.learning import saved_arrays
 from gmijax.learning.episode_window import Standing
 from gmijax.runs.folder import META, RunPaths, read_json, replay_name, replays_of, write_json
 from gmijax.runs.resume import CheckpointMeta, checkpoints_of, file_check, rank_of
@@ -91,17 +89,17 @@ def require_finite(params: PyTree, env_name: str, env_steps: int) -> None:
 
 def save_learner(paths: RunPaths, env_steps: int, learner_state: PyTree) -> None:
     """Writes the shared part of the checkpoint at `env_steps`, not yet under its name."""
-    _save(_partial(paths, env_steps) / LEARNER, _present(learner_state))
+    saved_arrays.save(_partial(paths, env_steps) / LEARNER, _present(learner_state))
 
 
 def save_envs(paths: RunPaths, env_steps: int, gmi: int, env_state: PyTree) -> None:
     """Writes the environments of one GMI, as `save_learner` does the shared part."""
-    _save(_partial(paths, env_steps) / f"gmi_{gmi}", env_state)
+    saved_arrays.save(_partial(paths, env_steps) / f"gmi_{gmi}", env_state)
 
 
 def save_replay(paths: RunPaths, env_steps: int, gmi: int, replay: PyTree) -> None:
     """Writes the replay of one GMI, as `save_learner` does the shared part."""
-    _save(_partial(paths, env_steps) / replay_name(gmi), replay)
+    saved_arrays.save(_partial(paths, env_steps) / replay_name(gmi), replay)
 
 
 def require_disk_for(run: RunPaths, replay: PyTree | None, num_gmis: int) -> None:
@@ -227,7 +225,7 @@ def restore_learner(checkpoint: Path, template: T) -> T:
       ConfigError: the checkpoint does not fit the template.
     """
     fields, folder = _present(template), checkpoint / LEARNER
-    restored = _restore(folder, fields)
+    restored = saved_arrays.restore(folder, fields)
     return restored if fields is template else cast("Any", template)._replace(**restored)
 
 
@@ -242,7 +240,7 @@ def learner_sizes(checkpoint: Path) -> tuple[int, int, int]:
       ConfigError: the checkpoint holds no learner's state.
     """
     folder = checkpoint / LEARNER
-    shapes = _saved_shapes(folder)
+    shapes = saved_arrays.saved_shapes(folder)
     try:
         (obs_size,) = shapes["obs_moments.mean"]
         (action_size,) = shapes["params.log_std"]
@@ -252,19 +250,9 @@ def learner_sizes(checkpoint: Path) -> tuple[int, int, int]:
     return obs_size, actor_obs_size, action_size
 
 
-def _saved_shapes(folder: Path) -> dict[str, tuple[int, ...]]:
-    """Shapes of all saved arrays by their dotted names; none if nothing can be read."""
-    try:
-        with _plain_path(folder) as path, ocp.StandardCheckpointer() as checkpointer:
-            saved: Any = checkpointer.metadata(path).item_metadata
-        return _shapes(saved.tree)
-    except (AttributeError, OSError, TypeError, ValueError):
-        return {}
-
-
 def restore_envs(checkpoint: Path, gmi: int, template: T) -> T:
     """The environments of one GMI; `template` gives structure, shapes and dtypes."""
-    return _restore(checkpoint / f"gmi_{gmi}", template)
+    return saved_arrays.restore(checkpoint / f"gmi_{gmi}", template)
 
 
 def restore_replay(checkpoint: Path, gmi: int, template: T) -> T:
@@ -275,7 +263,7 @@ def restore_replay(checkpoint: Path, gmi: int, template: T) -> T:
     """
     # Empty arrays of numpy take no memory until they are written.
     empty = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), template)
-    return on_host(_restore(checkpoint / replay_name(gmi), empty))
+    return saved_arrays.on_host(saved_arrays.restore(checkpoint / replay_name(gmi), empty))
 
 
 def digest(tree: PyTree) -> np.ndarray:
@@ -294,101 +282,8 @@ def _partial(paths: RunPaths, env_steps: int) -> Path:
     return partial
 
 
-def on_host(tree: T) -> T:
-    """A copy in the host's memory; random keys are plain arrays there."""
-    return jax.tree.map(lambda leaf: np.array(_without_key(leaf)), tree)
-
-
-def _save(folder: Path, tree: PyTree) -> None:
-    # A checkpoint says nothing of devices.
-    plain = jax.tree.map(np.asarray, _storable(tree))
-    with _plain_path(folder) as path, ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(path, plain)
-    if _difference(_saved_shapes(folder), _shapes(plain)) is not None:
-        raise GmijaxError(f"checkpoint {folder}: cannot be read again after it was written")
-
-
-@contextmanager
-def _plain_path(folder: Path) -> Iterator[Path]:
-    """A path of a folder, which need not be there yet, without any but plain characters.
-
-    Orbax looks for its own files by patterns that begin with the whole path, so brackets in it
-    hide them; TensorStore takes a backslash for a slash, and `gs:/` for a scheme.
-    """
-    parent = os.open(folder.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        yield Path(f"/proc/self/fd/{parent}") / folder.name
-    finally:
-        os.close(parent)
-
-
-def _restore(folder: Path, template: T) -> T:
-    plain = jax.tree.map(np.asarray, _storable(template))
-    try:
-        with _plain_path(folder) as path, ocp.StandardCheckpointer() as checkpointer:
-            restored = checkpointer.restore(path, plain)
-    except Exception as error:
-        # Orbax raises a plain `Exception` for an array that it cannot read. Anything else, such
-        # as a device without enough memory, does not say that the checkpoint is bad.
-        if not isinstance(error, ValueError | KeyError | OSError) and type(error) is not Exception:
-            raise
-        saved = _saved_shapes(folder)
-        why = (_difference(saved, _shapes(plain)) if saved else None) or lines_of(error)[0]
-        raise ConfigError(f"checkpoint {folder} does not fit this job: {why}") from error
-    # Orbax gives arrays of other shapes than those that were asked for.
-    if why := _difference(_shapes(restored), _shapes(plain)):
-        raise ConfigError(f"checkpoint {folder} does not fit this job: {why}")
-    return jax.tree.map(_restored, template, restored)
-
-
-def _difference(
-    saved: Mapping[str, tuple[int, ...]], wanted: Mapping[str, tuple[int, ...]]
-) -> str | None:
-    """The first array in which a checkpoint differs; None if none does."""
-    for name in sorted(saved.keys() | wanted.keys()):
-        if name not in wanted:
-            return f"it has {name}, this job has not"
-        if name not in saved:
-            return f"it has no {name}, this job has"
-        if saved[name] != wanted[name]:
-            return f"its {name} is {list(saved[name])}, that of this job {list(wanted[name])}"
-    return None
-
-
-def _shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
-    """Shapes of all arrays of a tree by their dotted names."""
-    return {
-        jax.tree_util.keystr(path, simple=True, separator="."): leaf.shape
-        for path, leaf in jax.tree.leaves_with_path(tree)
-    }
-
-
 def _present(state: Any) -> Any:
     """The fields of a named tuple that are not None: older checkpoints do not know the others."""
     if not hasattr(state, "_asdict"):
         return state
     return {name: part for name, part in state._asdict().items() if part is not None}
-
-
-def _is_key(leaf: jax.Array) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _storable(tree: T) -> T:
-    # Orbax takes neither typed random keys, whose bits are plain uint32 arrays, nor arrays
-    # without elements, such as the activations of a model that has none.
-    def plain(leaf: jax.Array) -> Any:
-        return np.zeros(1, np.float32) if leaf.size == 0 else _without_key(leaf)
-
-    return jax.tree.map(plain, tree)
-
-
-def _without_key(leaf: jax.Array) -> jax.Array:
-    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
-
-
-def _restored(like: jax.Array, leaf: jax.Array) -> jax.Array:
-    if like.size == 0:
-        return like
-    array = jnp.array(leaf)
-    return jax.random.wrap_key_data(array) if _is_key(like) else array

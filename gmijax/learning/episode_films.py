@@ -18,7 +18,7 @@ class EpisodeFilms:
 
     Args:
       config: of the run.
-      env: the worlds in which evaluations are made.
+      env: the environments in which evaluations are made.
       run: the run folder.
 
     Raises:

@@ -40,13 +40,14 @@ class EpisodeWindow:
     """Means over the latest episodes.
 
     There are two windows. The short one is the fewest iterations that hold WINDOW_EPISODES: it is
-    quick, but what it holds depends on when episodes end. Where worlds are in step, it can hold
-    short episodes alone, and at the start it always does. The long one spans at least a time limit
-    of every world too, so it holds episodes of every length as often as they occur. It is full
-    when it is that long without the first time limit, in which only short episodes can end.
+    quick, but what it holds depends on when episodes end. Where environments are in step, it can
+    hold short episodes alone, and at the start it always does. The long one spans at least a time
+    limit of every environment too, so it holds episodes of every length as often as they occur. It
+    is full when it is that long without the first time limit, in which only short episodes can
+    end.
 
     Args:
-      limit_steps: a time limit of all worlds together, in environment steps.
+      limit_steps: a time limit of all environments together, in environment steps.
     """
 
     def __init__(self, limit_steps: float = 0.0) -> None:
@@ -99,15 +100,15 @@ class EpisodeWindow:
         ended = [one._asdict() for one in self._ended]
         return {"steps": self._steps, "began": self._began, "ended": ended}
 
-    def restore(self, state: Mapping[str, Any], *, worlds_go_on: bool) -> None:
+    def restore(self, state: Mapping[str, Any], *, envs_go_on: bool) -> None:
         """Goes on from what `state` returned.
 
         Args:
           state: of the run that this one continues, with the same task.
-          worlds_go_on: whether worlds are where they were; else all begin an episode now.
+          envs_go_on: whether environments are where they were; else all begin an episode now.
         """
         self._steps = state["steps"]
-        self._began = state["began"] if worlds_go_on else self._steps
+        self._began = state["began"] if envs_go_on else self._steps
         self._ended = deque(EpisodeTotals(**one) for one in state["ended"])
         self._count = sum(one.count for one in self._ended)
 

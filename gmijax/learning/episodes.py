@@ -1,7 +1,7 @@
 """Whole episodes with a policy: one per environment, nothing learned.
 
-An episode runs in chunks of one compiled program. A world whose episode is over stands still
-until the last one has ended, so no automatic reset is needed.
+An episode runs in chunks of one compiled program. An environment whose episode is over stands
+still until the last one has ended, so no automatic reset is needed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gmijax.learning.unroll import act, unroll
 from gmijax.player.outcome import Episodes
 from gmijax.sim.divergence import diverged_by_source, end_diverged
 from gmijax.sim.interface import Env, EnvState
-from gmijax.sim.wrappers import BatchState, env_keys, select_worlds, training_env, vectorise
+from gmijax.sim.wrappers import BatchState, env_keys, select_envs, training_env, vectorise
 from gmijax.types import Array, PRNGKey, PyTree
 
 CHUNK_STEPS = 50
@@ -52,7 +52,7 @@ class EpisodeRunner:
     """Programs that run episodes to their ends, made once for weights of the same shapes.
 
     Args:
-      env: one world, with its time limit.
+      env: one environment, with its time limit.
       learner: the networks.
       options: how to run, and how many episodes.
     """
@@ -126,7 +126,7 @@ def run_episodes(
     """Compiles and runs episodes, once.
 
     Args:
-      env: one world, with its time limit.
+      env: one environment, with its time limit.
       learner: the networks.
       state: their weights and the observations' statistics.
       options: how to run, and how many episodes.
@@ -160,11 +160,11 @@ def _run_chunk(
     limit: Array,
     batch: BatchState,
 ) -> tuple[BatchState, Array, Array, Array]:
-    """Moves every world by up to `CHUNK_STEPS`.
+    """Moves every environment by up to `CHUNK_STEPS`.
 
     Returns:
-      The state, qpos [CHUNK_STEPS, E, nq], which worlds diverged meanwhile, and whose episodes
-      still run, [N] bool both.
+      The state, qpos [CHUNK_STEPS, E, nq], which environments diverged meanwhile, and whose
+      episodes still run, [N] bool both.
     """
     weights = acting_weights(learner, state)
     step_all = vectorise(env).step
@@ -185,8 +185,8 @@ def _run_chunk(
             before.head_start,
         )
         running = _is_running(before.env, limit)
-        # In this order: contacts that all worlds share must be those after the step.
-        kept = select_worlds(~running, before, after)
+        # In this order: contacts that all environments share must be those after the step.
+        kept = select_envs(~running, before, after)
         return kept, (_shown_qpos(env, kept.env, options.num_shown), running & bad)
 
     stopping: Any = training_env(env)._replace(model=model, step=step)
@@ -197,10 +197,10 @@ def _run_chunk(
 
 
 def _without_bad_numbers(env: Env, before: EnvState, state: EnvState) -> tuple[EnvState, Array]:
-    """Ends diverged worlds as training does, where they last were: they may be filmed."""
+    """Ends diverged environments as training does, where they last were: they may be filmed."""
     bad = diverged_by_source(env, state)["any"]
     ended = end_diverged(before, state, bad)
-    return ended._replace(physics=select_worlds(bad, before.physics, ended.physics)), bad
+    return ended._replace(physics=select_envs(bad, before.physics, ended.physics)), bad
 
 
 def _is_running(state: EnvState, limit: Array | int) -> Array:

@@ -1,8 +1,9 @@
 """Evaluation while training: whole episodes with the policy as it is, run by all GMIs that train.
 
-The worlds are the evaluations' own, and so are their random keys: episode j of an evaluation is
-world 2^30 + j of the job. So training goes on as if there were no evaluations, all evaluations of
-a run begin in the same states, and how many GMIs share the episodes makes no difference.
+The environments are the evaluations' own, and so are their random keys: episode j of an evaluation
+is environment 2^30 + j of the job. So training goes on as if there were no evaluations, all
+evaluations of a run begin in the same states, and how many GMIs share the episodes makes no
+difference.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from gmijax.learning.episodes import EpisodeOptions, EpisodeRunner, Episodes
 from gmijax.learning.learner import Learner, TrainState
 from gmijax.runs.folder import RunPaths
 from gmijax.sim.interface import Env
-from gmijax.sim.randomize import make_worlds
+from gmijax.sim.randomize import make_envs
 from gmijax.sim.trajectory import MOST_RECORDED
 
-FIRST_WORLD = 2**30
-"""Number of the first world of an evaluation: no training has as many."""
+FIRST_EVAL_ENV = 2**30
+"""Number of the first environment of an evaluation: no training has as many."""
 
 
 class Evaluation(NamedTuple):
@@ -52,17 +53,17 @@ class Evaluation(NamedTuple):
 
 
 def evaluation_worlds(config: TrainConfig, rank: int, world_size: int) -> Env:
-    """The worlds in which the GMI with this rank evaluates.
+    """The environments in which the GMI with this rank evaluates.
 
     As many on each, so that all run the same program: there may be more than episodes. Without a
     curriculum, so that evaluations can be compared.
     """
     num_envs = -(-config.eval.episodes // world_size)
-    return make_worlds(
+    return make_envs(
         dataclasses.replace(config.env, curriculum="off"),
         config.physics.impl,
         seed=config.seed,
-        first_env=FIRST_WORLD + rank * num_envs,
+        first_env=FIRST_EVAL_ENV + rank * num_envs,
         num_envs=num_envs,
     )
 
@@ -100,7 +101,7 @@ class Evaluator:
             seed=config.seed,
             deterministic=config.eval.deterministic,
             max_steps=None,
-            first_env=FIRST_WORLD + first,
+            first_env=FIRST_EVAL_ENV + first,
         )
         self._runner = EpisodeRunner(env, learner, options)
         self._films: EpisodeFilms | None = None

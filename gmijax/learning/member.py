@@ -22,7 +22,6 @@ from gmijax.errors import NonFiniteError, ReportedError
 from gmijax.learning.algorithm import IterationMetrics
 from gmijax.learning.checkpoint import (
     checkpoint_meta,
-    on_host,
     require_finite,
     restore_replay,
     save_episodes,
@@ -31,6 +30,7 @@ from gmijax.learning.checkpoint_saver import CheckpointPart
 from gmijax.learning.evaluator import Evaluation
 from gmijax.learning.learner import TrainState
 from gmijax.learning.policy_file import save_policy
+from gmijax.learning.saved_arrays import on_host
 from gmijax.learning.start import first_window, replay_goes_on
 from gmijax.learning.training_log import TrainingLog, UpdateMetrics
 from gmijax.runs.folder import RunPaths, write_json

@@ -45,7 +45,7 @@ class Moments(NamedTuple):
 def without_outliers(moments: Moments, samples: Array) -> Array:
     """`samples` [..., S], clipped to OUTLIER_STD around the mean that `moments` know.
 
-    A world about to diverge shows values thousands of times the usual; a few of them would
+    An environment about to diverge shows values thousands of times the usual; a few of them would
     widen the variance for good and blind the policy. Real changes are not held up: the variance
     may grow 400-fold in one merge. Nothing is clipped while there are no statistics.
     """

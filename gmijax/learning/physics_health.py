@@ -16,11 +16,11 @@ TOLERATED_STEPS = 10
 
 
 def check_diverged(where: str, diverged: Mapping[str, float], steps: float) -> None:
-    """Ends a job in which worlds diverge more often than now and then.
+    """Ends a job in which environments diverge more often than now and then.
 
     Args:
       where: task and time, for the message.
-      diverged: worlds that were ended because of a bad number: `any`, and by its source (see
+      diverged: environments that were ended because of a bad number: `any`, and by its source (see
         `gmijax.sim.divergence`).
       steps: environment steps in which that happened.
 

@@ -23,7 +23,7 @@ def save_policy(
 ) -> None:
     """Writes it beside the learner's state, as `save_learner` does that.
 
-    `state` is in the host's memory (`checkpoint.on_host`).
+    `state` is in the host's memory (`saved_arrays.on_host`).
     """
     path = paths.unfinished(env_steps) / POLICY
     write_policy(path, plain_policy(env, algo, state, env_steps=env_steps))

@@ -26,14 +26,14 @@ from gmijax.machine.host_limits import detect_host
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.runs.saved_config import saved_config
 from gmijax.sim.interface import Env
-from gmijax.sim.randomize import make_worlds
+from gmijax.sim.randomize import make_envs
 from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
 from gmijax.types import Array, PRNGKey
 
 
-def worlds_of(config: TrainConfig | ServeConfig, place: int) -> Env:
-    """The worlds of the GMI that is number `place` of those that simulate."""
-    return make_worlds(
+def envs_of(config: TrainConfig | ServeConfig, place: int) -> Env:
+    """The environments of the GMI that is number `place` of those that simulate."""
+    return make_envs(
         config.env,
         config.physics.impl,
         seed=config.seed,
@@ -150,7 +150,7 @@ def first_window(
 
     Args:
       config: of the run.
-      limit_steps: a time limit of all its worlds together, in environment steps.
+      limit_steps: a time limit of all its environments together, in environment steps.
       gmi: one that simulates.
       num_gmis: see `first_envs`.
     """
@@ -158,7 +158,7 @@ def first_window(
     if config.run.resume is not None:
         saved = saved_episodes(Path(config.run.resume), config)
         if saved is not None:
-            window.restore(saved, worlds_go_on=envs_go_on(config, gmi, num_gmis))
+            window.restore(saved, envs_go_on=envs_go_on(config, gmi, num_gmis))
     return window
 
 

@@ -185,12 +185,8 @@ class TrainingLog:
             "wall_s": now_s - self._started_s,
             "env_steps_per_s": steps / line_s,
             **means,
-            "diverged_steps": counts.diverged["any"],
-            **overflow_line(counts.overflowed),
-            "reward_per_step": counts.reward_sum / simulated if simulated else None,
-            **{f"loss/{name}": value for name, value in learnt.losses.items()},
-            **learnt.figures,
-            **{f"policy/learning_rate_{name}": rate for name, rate in learnt.rates.items()},
+            **_counted(counts, simulated),
+            **_learnt(learnt),
             **others,
         }
         for sink in self._sinks:
@@ -201,6 +197,22 @@ class TrainingLog:
         """Flushes the lines."""
         for sink in self._sinks:
             sink.close()
+
+
+def _counted(counts: Any, simulated: int) -> Line:
+    return {
+        "diverged_steps": counts.diverged["any"],
+        **overflow_line(counts.overflowed),
+        "reward_per_step": counts.reward_sum / simulated if simulated else None,
+    }
+
+
+def _learnt(learnt: UpdateMetrics) -> Line:
+    return {
+        **{f"loss/{name}": value for name, value in learnt.losses.items()},
+        **learnt.figures,
+        **{f"policy/learning_rate_{name}": rate for name, rate in learnt.rates.items()},
+    }
 
 
 def _finite(value: float | int | None) -> float | int | None:

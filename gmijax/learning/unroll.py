@@ -32,7 +32,7 @@ class Counts(NamedTuple):
     Attributes:
       episodes: sums over the episodes that ended.
       reward_sum: sum of all rewards, unscaled.
-      diverged: steps that ended a world because of a bad number, by where it was.
+      diverged: steps that ended an environment because of a bad number, by where it was.
       overflowed: steps for which a buffer of the simulator was too small, by which.
     """
 

@@ -24,8 +24,8 @@ from gmijax.learning.normalize import normalize
 from gmijax.player.joystick import Ground, Readings, Robot, with_pushes
 from gmijax.player.walking import LENGTH_S, ONE_ACTION, Recording, Walk, measure
 from gmijax.sim.interface import Env, EnvState
-from gmijax.sim.randomize import make_worlds
-from gmijax.sim.wrappers import env_keys, select_worlds, vectorise
+from gmijax.sim.randomize import make_envs
+from gmijax.sim.wrappers import env_keys, select_envs, vectorise
 from gmijax.types import Array, PyTree
 
 FIRST_ENV = 3 * 2**29
@@ -104,7 +104,7 @@ def walking_env(config: EnvConfig, robot: Robot, impl: str, num_envs: int) -> En
     if config.action_repeat != 1:  # Pushes and commands in between would not be seen.
         raise ConfigError(f"env.action_repeat={config.action_repeat}: {ONE_ACTION}")
     tested = dataclasses.replace(with_pushes(config, robot), randomize="off", curriculum="off")
-    return make_worlds(tested, impl, seed=0, first_env=FIRST_ENV, num_envs=num_envs)
+    return make_envs(tested, impl, seed=0, first_env=FIRST_ENV, num_envs=num_envs)
 
 
 def act_of(learner: Learner) -> Act:
@@ -127,7 +127,7 @@ def _run_chunk(
         data = after.physics.data
         # One with bad numbers stays where it was: others may share buffers with it.
         bad = ~jnp.isfinite(data.qpos).all(-1) | ~jnp.isfinite(data.qvel).all(-1)
-        return select_worlds(bad, before, after), recorded(readings, before, after)
+        return select_envs(bad, before, after), recorded(readings, before, after)
 
     return jax.lax.scan(step, state, length=CHUNK_STEPS)
 

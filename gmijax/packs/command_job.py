@@ -13,7 +13,7 @@ from pathlib import Path
 from gmijax.config.pack import PackConfig
 from gmijax.errors import ConfigError
 from gmijax.packs.template import fill, require_names
-from gmijax.sweeps.kind import label_of
+from gmijax.sweeps.any_job import label_of
 from gmijax.sweeps.paths import DIGITS
 from gmijax.sweeps.progress import Progress
 

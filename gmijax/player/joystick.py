@@ -18,8 +18,6 @@ from gmijax.config import EnvConfig
 from gmijax.config.env import ROBOTS as NAMES
 from gmijax.sim.robots import robot_name
 
-Floats = npt.NDArray[np.float32]
-
 EDGE_M: Final = 9.5
 """Rough terrain ends 10 m from its middle, and beyond it is nothing."""
 

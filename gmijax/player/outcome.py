@@ -22,7 +22,7 @@ class Episodes(NamedTuple):
       diverged: [N] bool, terminated because of a bad number (see `gmijax.sim.divergence`).
       terms: [N] each, what every reward term added to the returns.
       metrics: [N] each, the task's metrics at the end.
-      qpos: [L + 1, E, nq] positions of the first E worlds, from the start to the end of the
+      qpos: [L + 1, E, nq] positions of the first E environments, from the start to the end of the
         longest of their episodes; L is that episode's length. For pictures: see `Env.qpos`.
       compile_s: seconds that tracing and compiling took.
       run_s: seconds of simulation.

@@ -1,4 +1,4 @@
-"""A shipped task in plain MuJoCo: one world, with nothing compiled and no jax.
+"""A shipped task in plain MuJoCo: one environment, with nothing compiled and no jax.
 
 The task's own functions run here, on numpy (`gmijax.arrays`), so observations, rewards and ends
 are those of training.
@@ -47,7 +47,7 @@ class Step(NamedTuple):
 
 
 class PlainEnv:
-    """One world of a task that plays episodes one after the other.
+    """One environment of a task that plays episodes one after the other.
 
     Forces that are written into `data.xfrc_applied` ([nbody, 6], N and N m, in the world) act in
     every step until they are changed; `reset` clears them.
@@ -58,7 +58,7 @@ class PlainEnv:
       seed: of the episodes' starts, commands and goals.
 
     Attributes:
-      physics: MuJoCo in C, which moves the world.
+      physics: MuJoCo in C, which simulates the task.
       state: of the task, its arrays numpy's.
 
     Raises:
@@ -150,7 +150,8 @@ class PlainEnv:
     def step(self, action: npt.ArrayLike) -> Step:
         """One control step with an action [A], which is clipped to [-1, 1].
 
-        A world whose numbers leave every bound ends with reward 0 (`gmijax.sim.divergence`).
+        An environment whose numbers leave every bound ends with reward 0
+        (`gmijax.sim.divergence`).
         """
         before, given = self.state, constant(action)
         with np.errstate(over="ignore", invalid="ignore"):

@@ -77,7 +77,7 @@ def _episode(env: PlainEnv, policy: PlainPolicy, max_steps: int | None) -> Playe
 
 
 def together(episodes: Sequence[Played], run_s: float) -> Episodes:
-    """The episodes side by side; worlds whose episode is over stand still."""
+    """The episodes side by side; environments whose episode is over stand still."""
     longest = max(one.length for one in episodes)
 
     def column(name: str) -> npt.NDArray[np.float32]:

@@ -50,7 +50,7 @@ def obs_moments(config: PpoConfig, moments: Moments, obs: Array, out: StepOutput
 
 
 def until_diverged(is_diverged: Array, ended: Array) -> Array:
-    """Which steps [T, N] belong to an episode that ends later on because its world diverged.
+    """Which steps [T, N] belong to an episode that ends later on because its environment diverged.
 
     Long before a number leaves all bounds it is thousands of times the usual.
     """

@@ -71,20 +71,11 @@ def launch(
     """
     # Before anything else: the module of a GMI's role starts jobs without end otherwise.
     _require_no_gmi()
-    plan = plan.plan() if isinstance(plan, GMIManager) else plan
-    if not isinstance(plan, Plan):
-        raise ConfigError(f"plan={plan!r}: expected a plan of gmijax.plan, or a GMIManager")
+    plan = _plan(plan)
     roles = _roles(role, plan)
     _check_numbers(timeout_s, pipe_mib, start_timeout_s, stall_timeout_s, grace_s)
     machine = detect_machine()
-    # The plan may come from another machine, or from a time when there was more room here.
-    require_room(
-        plan.layout.num_gmis,
-        "plan",
-        machine.host,
-        len(machine.cpu_cores),
-        on_cpu=plan.backend == "cpu",
-    )
+    _require_room(plan, machine)
     config = {
         "roles": [type(each).__qualname__ for each in roles],
         "timeout_s": timeout_s,
@@ -94,19 +85,28 @@ def launch(
         "sys_path": [os.path.abspath(entry) for entry in sys.path],
     }
     run = _new_run(run_dir, plan, config, roles, args)
-    timeouts = Timeouts(
+    timeouts = _timeouts(start_timeout_s, stall_timeout_s, grace_s)
+    return _outputs(_job(plan, machine, run, timeouts, config["capacity_bytes"]))
+
+
+def _outputs(job: Launch) -> list[Any]:
+    """Runs the job; what every GMI's `run` returned, in order of id."""
+    try:
+        run_gmis(job)
+        outputs = [_output(job.run, gmi) for gmi in job.plan.layout.gmis]
+    except GmijaxError as error:
+        _explain(error, job.run)
+        raise
+    return [pickle.loads(output) for output in outputs]
+
+
+def _timeouts(start_timeout_s: float, stall_timeout_s: float | None, grace_s: float) -> Timeouts:
+    return Timeouts(
         start_timeout_s=start_timeout_s,
         stall_timeout_s=math.inf if stall_timeout_s is None else stall_timeout_s,
         stop_timeout_s=grace_s,
         grace_s=grace_s,
     )
-    try:
-        run_gmis(_job(plan, machine, run, timeouts, config["capacity_bytes"]))
-        outputs = [_output(run, gmi) for gmi in plan.layout.gmis]
-    except GmijaxError as error:
-        _explain(error, run)
-        raise
-    return [pickle.loads(output) for output in outputs]
 
 
 def _new_run(
@@ -133,6 +133,19 @@ def _require_no_gmi() -> None:
             "gmijax.launch: called inside a GMI; in the file of a role, call it below "
             'if __name__ == "__main__":'
         )
+
+
+def _plan(plan: Plan | GMIManager) -> Plan:
+    made = plan.plan() if isinstance(plan, GMIManager) else plan
+    if not isinstance(made, Plan):
+        raise ConfigError(f"plan={made!r}: expected a plan of gmijax.plan, or a GMIManager")
+    return made
+
+
+def _require_room(plan: Plan, machine: Machine) -> None:
+    """The plan may come from another machine, or from a time when there was more room here."""
+    num_cores, on_cpu = len(machine.cpu_cores), plan.backend == "cpu"
+    require_room(plan.layout.num_gmis, "plan", machine.host, num_cores, on_cpu=on_cpu)
 
 
 def _job(

@@ -1,4 +1,4 @@
-"""One world in MuJoCo in C and numpy, behind what tasks use of `gmijax.sim.physics.Physics`.
+"""One environment in MuJoCo in C and numpy, behind what tasks use of `gmijax.sim.physics.Physics`.
 
 So the functions of a task, which run on numpy as on JAX, play it without jax. Positions and
 velocities are float64 here, and all contacts count, so trajectories part from those of MJX within
@@ -38,9 +38,11 @@ class CPhysics:
         if missing := carried.needed(mj_model):
             raise NotImplementedError(f"MuJoCo in C: {missing[0]} is not carried")
         self.mj_model = copy.copy(mj_model)
-        # MuJoCo would start a world anew by itself that diverges; see `gmijax.sim.divergence`.
+        # MuJoCo would start an environment anew by itself that diverges; see
+        # `gmijax.sim.divergence`.
         self.mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        # A world that diverges ends; MuJoCo would also add a line to a file where the user stands.
+        # An environment that diverges ends; MuJoCo would also add a line to a file where the user
+        # stands.
         mujoco.set_mju_user_warning(lambda message: None)
         self.data = mujoco.MjData(self.mj_model)
         self.substeps = substeps

@@ -1,4 +1,4 @@
-"""What is written into films: labels of the worlds, and lines below them. No jax here."""
+"""What is written into films: labels of the environments, and lines below them. No jax here."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ class Captions:
     """The texts of one film; those that do not fit a small picture are left out.
 
     Args:
-      labels: one for each world.
+      labels: one for each environment.
       lines: below the picture; the last one gets the time of the film, on the right.
     """
 
     def __init__(self, labels: Sequence[str], lines: Sequence[str]) -> None:
         self._labels, self._lines = labels, lines
 
-    def label(self, world: int, tile: Image) -> Image:
-        """The tile [height, width, 3] with the label of its world in the upper left corner."""
-        if world >= len(self._labels) or tile.shape[1] < _NARROWEST_TILE:
+    def label(self, index: int, tile: Image) -> Image:
+        """The tile [height, width, 3] with its environment's label in the upper left corner."""
+        if index >= len(self._labels) or tile.shape[1] < _NARROWEST_TILE:
             return tile
-        text = self._labels[world]
+        text = self._labels[index]
         width = min(tile.shape[1], int(self._font.getlength(text)) + 2 * _MARGIN)
         corner = tile[:_LINE, :width]
         ground = Pillow.fromarray((corner * _VEIL).astype(np.uint8))

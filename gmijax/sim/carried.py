@@ -1,7 +1,7 @@
 """What may be carried between control steps beside positions, velocities and the warm start.
 
-MuJoCo's data have more that outlives a step. A world carries what its model cannot do without, and
-what a task sets at a start; all else costs nothing.
+MuJoCo's data have more that outlives a step. An environment carries what its model cannot do
+without, and what a task sets at a start; all else costs nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NAMES = (
 
 
 def at_start(mj_model: mujoco.MjModel, given: Mapping[str, Array]) -> dict[str, Array]:
-    """What a world carries that starts with what is `given`.
+    """What an environment carries that starts with what is `given`.
 
     Raises:
       ConfigError: a name or a shape that the model does not have.
@@ -31,11 +31,9 @@ def at_start(mj_model: mujoco.MjModel, given: Mapping[str, Array]) -> dict[str, 
     for name, value in given.items():
         if name not in shapes:
             known = ", ".join(shapes)
-            raise ConfigError(f"world.start: no {name} can be carried; allowed are {known}")
+            raise ConfigError(f"sim.start: no {name} can be carried; allowed are {known}")
         if np.shape(value) != shapes[name]:
-            raise ConfigError(
-                f"world.start: {name} has shape {np.shape(value)}, not {shapes[name]}"
-            )
+            raise ConfigError(f"sim.start: {name} has shape {np.shape(value)}, not {shapes[name]}")
     missing = [name for name in needed(mj_model) if name not in given]
     fresh = mujoco.MjData(mj_model) if missing else None
     first = {name: getattr(fresh, name) for name in missing}

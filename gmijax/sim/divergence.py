@@ -1,7 +1,7 @@
-"""Worlds whose numbers left every bound: noticed, ended, and counted.
+"""Environments whose numbers left every bound: noticed, ended, and counted.
 
-MuJoCo in C resets a world by itself when its state is not finite or beyond 1e10
-(`mj_checkPos` and its kin); MJX does not, and one such world in 10^8 steps would poison the
+MuJoCo in C resets an environment by itself when its state is not finite or beyond 1e10
+(`mj_checkPos` and its kin); MJX does not, and one such environment in 10^8 steps would poison the
 statistics and the weights of the whole job. Here such a step ends the episode with reward 0 and
 the last good observation. It is counted by where the bad number was, so that a task that makes
 them by mistake is not mistaken for a rare failure of the solver.
@@ -28,7 +28,7 @@ def sources(term_names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def diverged_by_source(env: Env, state: EnvState) -> dict[str, Array]:
-    """Which of `sources` hold bad numbers in worlds [N], or in one of numpy: [N] or [] bool."""
+    """Which of `sources` hold bad numbers: [N] bool, or [] bool for one environment in numpy."""
     xp = array_module(state.obs)
 
     def within(values: Array, bound: float) -> Array:
@@ -51,7 +51,7 @@ def _positions(env: Env, state: EnvState) -> Array:
 
 
 def end_diverged(before: EnvState, state: EnvState, diverged: Array) -> EnvState:
-    """Ends the worlds [N], or [], that `diverged`, with numbers that others can compute with."""
+    """Ends the environments that `diverged` [N] or [] bool, with numbers that are finite."""
     xp = array_module(state.obs)
 
     def zero(values: Array) -> Array:

@@ -36,7 +36,7 @@ def uniform(
 
 
 def next_key(moves_on: Array, fresh: PRNGKey, key: PRNGKey) -> PRNGKey:
-    """`fresh` if the world `moves_on` [] bool, else `key`; a generator is both."""
+    """`fresh` if the environment `moves_on` [] bool, else `key`; a generator is both."""
     if isinstance(key, np.random.Generator):
         return key
     import jax.numpy as jnp

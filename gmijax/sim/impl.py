@@ -17,8 +17,8 @@ class WarpSizes(NamedTuple):
     """Sizes of MJX-Warp's buffers.
 
     Attributes:
-      contacts_per_env: the buffer that all worlds share holds so many for each of them.
-      constraints_per_env: rows of the constraint solver in one world.
+      contacts_per_env: the buffer that all environments share holds so many for each of them.
+      constraints_per_env: rows of the constraint solver in one environment.
     """
 
     contacts_per_env: int

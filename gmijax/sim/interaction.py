@@ -1,6 +1,6 @@
 """What the configuration puts around a task: a time limit, repeated actions, past observations.
 
-Each takes one world and returns one, on numpy as on JAX (`gmijax.arrays`).
+Each takes one environment and returns one, on numpy as on JAX (`gmijax.arrays`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def action_repeat(env: Env, times: int) -> Env:
     the result are actions: it has `times` the seconds per step, and as many seconds per episode.
 
     Args:
-      env: one world with its time limit, which counts the task's own steps.
+      env: one environment with its time limit, which counts the task's own steps.
       times: steps per action; with 1 `env` itself is returned.
     """
     if times == 1:
@@ -74,11 +74,11 @@ def _until_the_end(once: Callable[[EnvState], EnvState], state: EnvState, times:
         return state
     import jax
 
-    from gmijax.sim.wrappers import select_world
+    from gmijax.sim.wrappers import select_env
 
     def unless_ended(before: EnvState, _: None) -> tuple[EnvState, None]:
         ended = before.terminated | before.truncated
-        return select_world(ended, before, once(before)), None
+        return select_env(ended, before, once(before)), None
 
     return jax.lax.scan(unless_ended, state, length=times)[0]
 
@@ -90,7 +90,7 @@ def observation_history(env: Env, length: int) -> Env:
     (`EnvSpec.actor_obs_size`) is that of the last step alone, and stays at the end.
 
     Args:
-      env: one world.
+      env: one environment.
       length: observations in one; with 1 `env` itself is returned.
     """
     if length == 1:

@@ -1,4 +1,4 @@
-"""The environment interface: one world per function, worlds are added by `jax.vmap`.
+"""The interface of an environment: functions of a single one, `jax.vmap` makes a batch.
 
 An `Env` is a value: two pure functions, a model and a description. Wrappers take an `Env` and
 return an `Env`. The model is an argument of both functions, never a closure, so that domain
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from gmijax.types import Array, PRNGKey, PyTree
 
 OVERFLOWS = ("contact", "constraint")
-"""Buffers of MJX-Warp that can be too small: contacts of all worlds, constraints of one."""
+"""Buffers of MJX-Warp that can be too small: contacts of all environments, constraints of one."""
 
 
 class EnvSpec(NamedTuple):
@@ -26,8 +26,8 @@ class EnvSpec(NamedTuple):
       control_dt_s: seconds of simulated time per step.
       episode_length: steps after which an episode is truncated.
       reward_terms: names of the addends of the reward, in order.
-      max_abs_obs: an observation beyond this tells that the physics diverges; the world is ended
-        (see `gmijax.sim.divergence`).
+      max_abs_obs: an observation beyond this tells that the physics diverges; the environment is
+        ended (see `gmijax.sim.divergence`).
       metrics: names of the numbers that judge an episode beside its return, such as successes.
       obs_terms: parts of an observation in order, name and length each; they go into exported
         policies. Empty where nobody says.
@@ -48,7 +48,7 @@ class EnvSpec(NamedTuple):
 
 
 class EnvState(NamedTuple):
-    """State of one world and the outcome of its last step.
+    """State of one environment and the outcome of its last step.
 
     Attributes:
       physics: what the simulator must remember between steps (see `gmijax.sim.physics`).
@@ -61,7 +61,7 @@ class EnvState(NamedTuple):
       terminated: [] bool, the task has ended: the value of what follows is zero.
       truncated: [] bool, time ran out: bootstrap from the value of this observation.
       steps: [] int32, steps since the last reset.
-      key: the world's own random key; the next reset and the policy's noise come from it.
+      key: the environment's own random key; the next reset and the policy's noise come from it.
     """
 
     physics: PyTree
@@ -82,19 +82,20 @@ class Env(NamedTuple):
     Attributes:
       spec: sizes and names.
       model: the physics model (`mjx.Model`); pass it, or a randomised copy, to the functions.
-      reset: `(model, key) -> EnvState`, a fresh episode of one world; consumes `key`.
-      step: `(model, state, action [A]) -> EnvState`, one control step of one world.
+      reset: `(model, key) -> EnvState`, a fresh episode of one environment; consumes `key`.
+      step: `(model, state, action [A]) -> EnvState`, one control step of one environment.
       mj_model: the `mujoco.MjModel` behind `model`, for rendering and for the C oracle.
       qpos: `EnvState -> [nq]`, joint positions for rendering; after them, where mocap bodies
         move, their positions and their quaternions.
-      max_envs: most worlds that may be stepped at once, None for no limit.
+      max_envs: most environments that may be stepped at once, None for no limit.
       overflow: `EnvState -> [2]` bool, which of `OVERFLOWS` were too small in the last step; None
         if nothing can overflow.
-      model_axes: `in_axes` of `model` for `vmap` over worlds: None if they share it, else a tree
-        with 0 at the leaves that have a leading axis [N] (see `gmijax.sim.randomize`).
+      model_axes: `in_axes` of `model` for `vmap` over environments: None if they share it, else a
+        tree with 0 at the leaves that have a leading axis [N] (see `gmijax.sim.randomize`).
       next_episode: `(model, ended EnvState) -> EnvState`, the episode that follows one of the same
-        world, for tasks that carry something on in `task`, such as the level of a curriculum.
-        None: `reset(model, ended.key)`. Of a world that diverged `task` is that of one step
+        environment, for tasks that carry something on in `task`, such as the level of a
+        curriculum.
+        None: `reset(model, ended.key)`. Of an environment that diverged `task` is that of one step
         earlier.
       draw_models: `keys [N] -> model`, domain randomisation that the task brings itself: all
         leaves have an axis [N]. None if it brings none.

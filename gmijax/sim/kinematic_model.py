@@ -1,4 +1,4 @@
-"""A model of MJX-JAX that knows bodies, joints and masses, for worlds that others step."""
+"""A model of MJX-JAX that knows bodies, joints and masses, for environments that others step."""
 
 from __future__ import annotations
 

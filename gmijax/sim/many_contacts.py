@@ -7,7 +7,7 @@ import warnings
 from gmijax.sim.impl import Impl, WarpSizes
 
 MANY = 128
-"""Contacts of a world beyond which it is said, and up to which MuJoCo Warp has room for all."""
+"""Up to so many contacts of an environment MuJoCo Warp has room for all; more give a warning."""
 
 
 def warn_of_many(
@@ -18,7 +18,7 @@ def warn_of_many(
     Args:
       name: the model's.
       impl: which implementation.
-      contacts: all that a world can have at once.
+      contacts: all that an environment can have at once.
       rows: of constraints, with all of these.
       room: the sizes of MuJoCo Warp's buffers.
     """
@@ -34,9 +34,9 @@ def warn_of_many(
             "warp_sizes makes them larger"
         )
     warnings.warn(
-        f"{name}: its geoms can make {contacts:,} contacts ({rows:,} rows of constraints) in a "
-        f"world. {what}. Most robots have a variant for MJX (an _mjx file); else let primitives "
-        "collide instead of meshes",
+        f"{name}: its geoms can make {contacts:,} contacts ({rows:,} rows of constraints) in an "
+        f"environment. {what}. Most robots have a variant for MJX (an _mjx file); else let "
+        "primitives collide instead of meshes",
         RuntimeWarning,
         stacklevel=4,
     )

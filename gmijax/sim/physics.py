@@ -21,20 +21,19 @@ from numpy.typing import NDArray
 
 from gmijax.errors import ConfigError
 from gmijax.sim import carried
-from gmijax.sim.impl import ON_GPU, Impl, WarpSizes, choose_impl
+from gmijax.sim.impl import Impl, WarpSizes, choose_impl
 from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
 from gmijax.sim.kinematic_model import kinematic_model
 from gmijax.sim.many_contacts import warn_of_many
 from gmijax.sim.physics_state import PhysicsState
 from gmijax.sim.plain_model import plain
-from gmijax.sim.simulators import load_model
 from gmijax.sim.unsimulated import (
     FULL_NAMES,
     refuse_idle_sensors,
     refuse_parts,
 )
+from gmijax.sim.warp.batch import OVERFLOW, STATE, name_of
 from gmijax.sim.warp.step import WarpStep, moving
-from gmijax.sim.warp.worlds import OVERFLOW, STATE, name_of
 from gmijax.types import Array, PRNGKey, PyTree
 
 T = TypeVar("T")
@@ -46,7 +45,7 @@ CONTACT_BITS = ALL_BITS & ~(CONSTRAINT_BITS | LIMIT_BITS)
 
 
 def which_overflowed(bits: Array) -> Array:
-    """[2] bool, which of `OVERFLOWS` were too small, by a world's `overflow` [] of MJX-Warp."""
+    """[2] bool, which of `OVERFLOWS` were too small, by one environment's `overflow` []."""
     return (bits & jnp.array([CONTACT_BITS, CONSTRAINT_BITS])) != 0
 
 
@@ -59,7 +58,7 @@ class Physics:
       mj_model: the model as MuJoCo in C has it.
       model: the model on the device; pass it, or a randomised copy, to `step`.
       substeps: physics steps per control step.
-      max_envs: most worlds that may be stepped at once, None for no limit.
+      max_envs: most environments that may be stepped at once, None for no limit.
       warp: the control step of MuJoCo Warp; None with MJX-JAX.
     """
 
@@ -76,13 +75,13 @@ class Physics:
         return self.mj_model.opt.timestep * self.substeps
 
     def start(self, qpos: Array, qvel: Array, **given: Array) -> PhysicsState:
-        """The state of a world at `qpos` [nq], `qvel` [nv] with no history.
+        """The state of an environment at `qpos` [nq], `qvel` [nv] with no history.
 
         What only a physics step knows, such as sensors, is not computed: an automatic reset
-        happens, under `where`, in every step of every world.
+        happens, under `where`, in every step of every environment.
 
-        `given` is what the world carries beside that, by the names of `PhysicsState`. What is not
-        given stays as the model has it, but for activations, which begin at zero.
+        `given` is what the environment carries beside that, by the names of `PhysicsState`. What
+        is not given stays as the model has it, but for activations, which begin at zero.
 
         Raises:
           ConfigError: a name or a shape that the model does not have.
@@ -106,7 +105,7 @@ class Physics:
         return data.xpos, data.xquat
 
     def shown(self, state: PhysicsState) -> Array:
-        """[nq], or [nq + 7 nmocap] where mocap bodies move: what a picture of a world needs."""
+        """[nq], or [nq + 7 nmocap] where mocap bodies move: what a picture needs."""
         if state.mocap_pos is None and state.mocap_quat is None:
             return state.qpos
         there, turned = mocap_poses(self.mj_model)
@@ -121,11 +120,11 @@ class Physics:
         ctrl: Array,
         read: Callable[[mjx.Data], T] = lambda data: data.sensordata,
     ) -> tuple[PhysicsState, T]:
-        """Moves one world by one control step under `ctrl` [nu].
+        """Moves one environment by one control step under `ctrl` [nu].
 
         With MJX-Warp `model` may differ from the loaded one in `MODEL_LEAVES` of
-        `gmijax.sim.warp.worlds` only, and `read` sees the arrays of the data that have float32
-        numbers for each world.
+        `gmijax.sim.warp.batch` only, and `read` sees the arrays of the data that have float32
+        numbers for each environment.
 
         Returns:
           The new state, and `read` of the data of the last physics step. As in MuJoCo, the
@@ -134,9 +133,7 @@ class Physics:
         """
         before = {**{name: getattr(state, name) for name in STATE}, **state.carried()}
         if missing := [name for name in carried.needed(self.mj_model) if name not in before]:
-            raise ConfigError(
-                f"world.step: the state has no {missing[0]}, which world.start gives"
-            )
+            raise ConfigError(f"sim.step: the state has no {missing[0]}, which sim.start gives")
         if self.warp is not None:
             after, reading = self.warp(model, before, ctrl, read)
             overflow = which_overflowed(after.pop(OVERFLOW))
@@ -157,7 +154,7 @@ class Physics:
         reset: Callable[[PyTree, PRNGKey], EnvState],
         step: Callable[[PyTree, EnvState, Array], EnvState],
     ) -> Env:
-        """The environment whose `EnvState.physics` is this world's `PhysicsState`."""
+        """The environment whose `EnvState.physics` is this environment's `PhysicsState`."""
         return Env(
             spec=spec,
             model=self.model,
@@ -176,29 +173,6 @@ def mocap_poses(mj_model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[
     return data.mocap_pos.copy(), data.mocap_quat.copy()
 
 
-def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -> Physics:
-    """Loads the model `asset` that is shipped in `gmijax/sim/assets`.
-
-    Args:
-      asset: name of the file without `.xml`.
-      impl: `auto`, `jax` or `warp`.
-      substeps: physics steps per control step.
-      max_envs: upper bound of worlds simulated at once, None for no limit.
-
-    Raises:
-      ConfigError: `impl` cannot be had, or the model needs state that is not carried.
-    """
-    mj_model = load_model(asset)
-    chosen, _ = choose_impl(impl, jax.default_backend(), asset)
-    return from_mj_model(
-        mj_model,
-        impl=chosen,
-        substeps=substeps,
-        max_envs=max_envs,
-        warp_sizes=ON_GPU.get(asset),
-    )
-
-
 def from_mj_model(
     mj_model: mujoco.MjModel,
     *,
@@ -207,10 +181,18 @@ def from_mj_model(
     max_envs: int | None = None,
     warp_sizes: WarpSizes | None = None,
 ) -> Physics:
-    """Like `load`, for a model that is already in memory.
+    """A model with its simulator.
 
-    Without `warp_sizes` Warp's buffers hold what the model's geoms can make, up to a number of
-    contacts (`gmijax.sim.warp.sizes`).
+    Args:
+      mj_model: the model.
+      impl: `auto`, `jax` or `warp`.
+      substeps: physics steps per control step.
+      max_envs: upper bound of environments simulated at once, None for no limit.
+      warp_sizes: of Warp's buffers; None: for what the model's geoms can make, up to a number of
+        contacts (`gmijax.sim.warp.sizes`).
+
+    Raises:
+      ConfigError: `impl` cannot be had, or the model needs state that is not carried.
     """
     chosen, _ = choose_impl(impl, jax.default_backend())
     mj_model, name = plain(mj_model), name_of(mj_model)

@@ -1,4 +1,4 @@
-"""What one world carries from one control step to the next."""
+"""What one environment carries from one control step to the next."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gmijax.types import Array
 
 
 class PhysicsState(NamedTuple):
-    """What one world must remember between steps.
+    """What one environment must remember between steps.
 
     Attributes:
       qpos: [nq] float32, joint positions.
@@ -18,8 +18,8 @@ class PhysicsState(NamedTuple):
       overflow: [2] bool, which buffers of `OVERFLOWS` were too small in the last control step;
         None with MJX-JAX, whose buffers hold all that can ever be.
 
-    The others are `gmijax.sim.carried.NAMES`, as in MuJoCo's data; None where a world does not
-    carry them. `_replace` drives them: a push, the path of a mocap body.
+    The others are `gmijax.sim.carried.NAMES`, as in MuJoCo's data; None where an environment does
+    not carry them. `_replace` drives them: a push, the path of a mocap body.
 
     Attributes:
       act: [na] float32, activations; carried if the model has any.
@@ -46,6 +46,6 @@ class PhysicsState(NamedTuple):
     xfrc_applied: Array | None = None
 
     def carried(self) -> dict[str, Array]:
-        """What this world carries of `gmijax.sim.carried.NAMES`, by name."""
+        """What this environment carries of `gmijax.sim.carried.NAMES`, by name."""
         values = {name: getattr(self, name) for name in carried.NAMES}
         return {name: value for name, value in values.items() if value is not None}

@@ -1,8 +1,9 @@
-"""Worlds as a configuration describes them; domain randomisation: each has a model of its own.
+"""Environments as a configuration describes them, and domain randomisation: a model for each.
 
-The draws of a world depend on the seed and on its number in the whole job only, so k GMIs with n
-worlds simulate what one with k x n does, and a resumed job finds its worlds again without having
-saved them. Only the leaves that are drawn, and what follows from them, get a leading axis [N].
+The draws of an environment depend on the seed and on its number in the whole job only, so k GMIs
+with n environments simulate what one with k x n does, and a resumed job finds its environments
+again without having saved them. Only the leaves that are drawn, and what follows from them, get a
+leading axis [N].
 """
 
 from __future__ import annotations
@@ -43,14 +44,14 @@ _MASS_LEAVES = ("body_mass", "dof_armature")
 _CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0")
 
 
-def make_worlds(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_envs: int) -> Env:
-    """The task with what the configuration puts around it, its worlds randomised if it says so.
+def make_envs(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_envs: int) -> Env:
+    """The task with the wrappers and the randomisation that the configuration asks for.
 
     Args:
       config: task and randomisation.
       impl: MJX implementation, decided.
       seed: of the run.
-      first_env: number of the first of these worlds in the whole job.
+      first_env: number of the first of these environments in the whole job.
       num_envs: N.
     """
     env = make_env(
@@ -76,14 +77,14 @@ def make_worlds(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_
 def randomized(
     env: Env, ranges: Mapping[str, LeafRange], *, seed: int, first_env: int, num_envs: int
 ) -> Env:
-    """The task with a model of its own for each of N worlds.
+    """The task with a model of its own for each of N environments.
 
     Args:
-      env: the task, whose model all worlds share.
+      env: the task, whose model all environments share.
       ranges: what to draw, by leaf; empty: what the task itself draws.
       seed: the job's seed, the same on every GMI.
       first_env: global number of this GMI's first environment.
-      num_envs: N; the result is for exactly so many worlds.
+      num_envs: N; the result is for exactly so many environments.
 
     Raises:
       ConfigError: a task without a model of MJX, a name that the model does not have, a draw that
@@ -111,7 +112,7 @@ def randomized(
 
 
 class Drawn(NamedTuple):
-    """A task's memory, and which model its world has in this episode, [] int32."""
+    """A task's memory, and which model its environment has in this episode, [] int32."""
 
     task: PyTree
     number: Array
@@ -123,7 +124,7 @@ def randomized_by_episode(
     """The task with another model in every episode, one of `num_models` that all GMIs draw alike.
 
     The models are drawn beforehand, because MuJoCo in C computes what follows from their masses.
-    A world takes its own out of the pool in every step.
+    An environment takes its own out of the pool in every step.
 
     Args, Raises: as `randomized`.
     """
@@ -174,12 +175,12 @@ def _leaves(tree: PyTree) -> list[Any]:
 
 
 def _drawn(env: Env, keys: PRNGKey, leaf: str, drawn: LeafRange) -> Floats:
-    """The leaf of all worlds [N, ...]."""
+    """The leaf of all environments [N, ...]."""
     rows, columns = _rows(env, leaf, drawn.names), _COLUMNS.get(leaf)
     nominal = np.asarray(getattr(env.mj_model, leaf), np.float32)
     values = nominal[rows] if columns is None else nominal[rows, columns]
     _check_values(env, leaf, drawn, values)
-    # From the name, so that a world keeps its masses when its friction is drawn too.
+    # From the name, so that an environment keeps its masses when its friction is drawn too.
     stream = zlib.crc32(leaf.encode())
     shape = (len(rows) if drawn.draw == "each" else 1,)
     low, high = drawn.range
@@ -230,15 +231,15 @@ def _servo_bias(mj_model: mujoco.MjModel, gain: Floats) -> Floats:
 def _constants(mj_model: mujoco.MjModel, leaves: Leaves, num_envs: int) -> Leaves:
     """What MuJoCo derives from masses and armatures when it compiles a model, [N, ...] each.
 
-    Constraints are as stiff as these say. 20 to 90 microseconds a world.
+    Constraints are as stiff as these say. 20 to 90 microseconds an environment.
     """
     scratch = copy.copy(mj_model)
     data = mujoco.MjData(scratch)
     given = [name for name in ("body_mass", "body_inertia", "dof_armature") if name in leaves]
     rows: dict[str, list[Any]] = {name: [] for name in _CONSTANTS if getattr(mj_model, name).size}
-    for world in range(num_envs):
+    for index in range(num_envs):
         for name in given:
-            getattr(scratch, name)[:] = leaves[name][world]
+            getattr(scratch, name)[:] = leaves[name][index]
         mujoco.mj_setConst(scratch, data)
         for name, values in rows.items():
             values.append(getattr(scratch, name).copy())

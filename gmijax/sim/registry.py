@@ -188,7 +188,7 @@ def make_env(
       source_sha256: digest of a custom task's file, which is not executed with another one.
       rewards: weights of terms of the reward by name, in place of the task's own.
       settings: numbers of the task by name (`gmijax.sim.tasks.settings`), as `rewards`.
-      curriculum: whether a world's episodes get harder as they succeed.
+      curriculum: whether an environment's episodes get harder as they succeed.
       api: `gmijax` for an `Env`, `brax` for a `brax.envs.Env` without a time limit, as Brax's
         wrappers want it.
 
@@ -197,20 +197,12 @@ def make_env(
         that cannot be had, a length below 1, or a length for `brax`, whose `EpisodeWrapper`
         takes it; or `jax_enable_x64` is on.
     """
-    if api not in ("gmijax", "brax"):
-        raise ConfigError(f"api={api}: allowed are gmijax, brax")
-    if episode_length is not None and api == "brax":
-        raise ConfigError("episode_length: give it to Brax's EpisodeWrapper with api=brax")
+    _require_api(api, episode_length)
     if episode_length is not None:
         episode_length = whole_number("env.episode_length", episode_length)
     if max_envs is not None:
         max_envs = whole_number("max_envs", max_envs)
-    if api == "brax":
-        require_task("", "brax")
-    if suite == "gmijax" and ".py:" in name:
-        suite = "custom"
-    if suite == "gmijax" and name in ROBOTS:
-        suite = "playground"
+    suite = _suite_of(name, suite)
     changes: dict[str, Any] = {"rewards": rewards, "settings": settings, "curriculum": curriculum}
     from gmijax.devices import require_32_bit
 
@@ -223,6 +215,22 @@ def make_env(
     from gmijax.sim.interaction import time_limit
 
     return time_limit(env, episode_length or env.spec.episode_length)
+
+
+def _require_api(api: str, episode_length: int | None) -> None:
+    if api not in ("gmijax", "brax"):
+        raise ConfigError(f"api={api}: allowed are gmijax, brax")
+    if api == "brax":
+        if episode_length is not None:
+            raise ConfigError("episode_length: give it to Brax's EpisodeWrapper with api=brax")
+        require_task("", "brax")
+
+
+def _suite_of(name: str, suite: str) -> str:
+    """The suite of a task that is named without it."""
+    if suite == "gmijax" and ".py:" in name:
+        return "custom"
+    return "playground" if suite == "gmijax" and name in ROBOTS else suite
 
 
 def warn_on_cpu(env: Env) -> None:

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
 
+from gmijax.sim.impl import ON_GPU, choose_impl
+
 if TYPE_CHECKING:
     from gmijax.sim.physics import Physics
 
 C: Final = "c"
-"""The implementation that is MuJoCo in C: one world in numpy, for the player."""
+"""The implementation that is MuJoCo in C: one environment in numpy, for the player."""
 
 
 def load_model(asset: str) -> mujoco.MjModel:
@@ -25,9 +27,9 @@ def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -
 
     Args:
       asset: see `load_model`.
-      impl: `auto`, `jax` or `warp`, see `gmijax.sim.physics.load`; `c`: `gmijax.sim.c_physics`.
+      impl: `auto`, `jax` or `warp`, see `gmijax.sim.impl`; `c`: `gmijax.sim.c_physics`.
       substeps: physics steps per control step.
-      max_envs: upper bound of worlds simulated at once, None for no limit.
+      max_envs: upper bound of environments simulated at once, None for no limit.
 
     Raises:
       ConfigError: `impl` cannot be had, or the model needs state that is not carried.
@@ -35,8 +37,17 @@ def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -
     if impl == C:
         from gmijax.sim.c_physics import CPhysics
 
-        world: Any = CPhysics(load_model(asset), substeps)
-        return world
-    from gmijax.sim import physics
+        sim: Any = CPhysics(load_model(asset), substeps)
+        return sim
+    import jax
 
-    return physics.load(asset, impl=impl, substeps=substeps, max_envs=max_envs)
+    from gmijax.sim.physics import from_mj_model
+
+    chosen, _ = choose_impl(impl, jax.default_backend(), asset)
+    return from_mj_model(
+        load_model(asset),
+        impl=chosen,
+        substeps=substeps,
+        max_envs=max_envs,
+        warp_sizes=ON_GPU.get(asset),
+    )

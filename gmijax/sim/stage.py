@@ -1,4 +1,4 @@
-"""Draws one world with MuJoCo, without a display. No jax here.
+"""Draws one environment with MuJoCo, without a display. No jax here.
 
 MuJoCo chooses its OpenGL when it is imported, from MUJOCO_GL: see `gmijax.machine.opengl`.
 """
@@ -30,7 +30,7 @@ class Stage:
     """A model, a camera, and an off-screen OpenGL context.
 
     Args:
-      model: a `mujoco.MjModel`, or its file in MuJoCo's binary format; None: an empty world.
+      model: a `mujoco.MjModel`, or its file in MuJoCo's binary format; None: an empty scene.
       size: width and height of a picture, pixels.
       camera: see `gmijax.sim.camera.choose_camera`.
 
@@ -70,7 +70,7 @@ class Stage:
         self._renderer.close()
 
     def picture(self, qpos: npt.NDArray[Any]) -> Image:
-        """The picture [height, width, 3] of one world at `qpos`, as a `Trajectory` has it."""
+        """The picture [height, width, 3] of an environment at `qpos`, as a `Trajectory` has it."""
         command = put(self._data, qpos)
         self._mujoco.mj_fwdPosition(self._model, self._data)
         self._renderer.update_scene(self._data, self._view)

@@ -1,6 +1,6 @@
-"""What is filmed: positions of worlds over time, and their model, as files. No jax here.
+"""What is filmed: positions of environments over time, and their model, as files. No jax here.
 
-Films show worlds by quantiles of their returns: the first ones may all have failed, or none.
+Films show environments by quantiles of their returns: the first ones may all have failed, or none.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from gmijax.runs.folder import write_bytes
 
 
 class Trajectory(NamedTuple):
-    """Episodes of some worlds, side by side.
+    """Episodes of some environments, side by side.
 
     Attributes:
       qpos: [L + 1, E, nq], or longer where mocap bodies move: see `Env.qpos`; at its end
         `Env.command`, if there is one.
       lengths: [E] steps of every episode.
       control_dt_s: seconds per step.
-      labels: what to write into the picture of every world.
+      labels: what to write into the picture of every environment.
       lines: what to write below all of them.
     """
 
@@ -36,7 +36,7 @@ class Trajectory(NamedTuple):
 
 
 MOST_RECORDED = 64
-"""Worlds of which positions are kept, for a film to choose from."""
+"""Environments of which positions are kept, for a film to choose from."""
 
 
 def chosen(
@@ -66,16 +66,16 @@ def chosen(
     lengths, returns = lengths[:num_recorded], returns[:num_recorded]
     order = np.argsort(returns, kind="stable")
     at = (np.arange(count) + 0.5) / count * len(order)
-    worlds = order[at.astype(int)]
+    indices = order[at.astype(int)]
     labels = [
-        f"return {rounded(float(returns[world]))} (rank {len(order) - int(place)} of {len(order)})"
-        for place, world in zip(at, worlds, strict=True)
+        f"return {rounded(float(returns[index]))} (rank {len(order) - int(place)} of {len(order)})"
+        for place, index in zip(at, indices, strict=True)
     ]
     median = f"median return {rounded(float(np.median(returns)))} of {len(order)} episodes"
-    longest = int(lengths[worlds].max())
+    longest = int(lengths[indices].max())
     return Trajectory(
-        qpos[: longest + 1, worlds],
-        lengths[worlds],
+        qpos[: longest + 1, indices],
+        lengths[indices],
         control_dt_s,
         labels,
         (f"{title}: {median}", f"$ {command}"),

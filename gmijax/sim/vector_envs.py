@@ -97,10 +97,10 @@ def make_vector_env(
         Stable-Baselines3, `rsl_rl` for one of rsl_rl.
       arrays: what goes in and comes out, of `gymnasium` only: `numpy` (default), `torch`, on the
         GPU of jax without a copy (DLPack) where both use one, or `jax`.
-      autoreset: when a world that has ended starts over, of `gymnasium` only: `same_step`
+      autoreset: when an environment that has ended starts over, of `gymnasium` only: `same_step`
         (default), `next_step`, which its wrappers of observations want, or `disabled`.
-      render_mode: `rgb_array` for pictures of all worlds by `render()`, not of `rsl_rl`; needs
-        OpenGL.
+      render_mode: `rgb_array` for pictures of all environments by `render()`, not of `rsl_rl`;
+        needs OpenGL.
       suite: see `make_env`.
       impl: see `make_env`.
       episode_length: see `make_env`.
@@ -113,6 +113,25 @@ def make_vector_env(
         this `api`; a package that is not installed; pictures where nothing can be drawn.
     """
     num_envs = whole_number("num_envs", num_envs)
+    _require_options(api, arrays, autoreset, render_mode)
+    own = _OWN_ARRAYS.get(api)
+    chosen = own or arrays or "numpy"
+    _require_packages(api, chosen)
+    if render_mode is not None and (why_not := why_no_opengl()) is not None:
+        raise ConfigError(f"render_mode={render_mode}: {why_not}")
+    env = make_env(name, suite=suite, impl=impl, episode_length=episode_length, max_envs=num_envs)
+    warn_on_cpu(env)
+    module = importlib.import_module(f"gmijax.sim.adapters.to_{api}")
+    options = {"arrays": chosen, "autoreset": autoreset or "same_step"} if own is None else {}
+    if render_mode is not None:
+        options["render_mode"] = render_mode
+    return module.make(env, num_envs, **options)
+
+
+def _require_options(
+    api: str, arrays: str | None, autoreset: str | None, render_mode: str | None
+) -> None:
+    """Refuses values that are not allowed, or not with this `api`."""
     _require("api", api, tuple(_PACKAGES))
     _require("arrays", arrays, (None, *_ARRAYS))
     _require("autoreset", autoreset, (None, *_AUTORESETS))
@@ -122,17 +141,6 @@ def make_vector_env(
         raise ConfigError(f"api={api}: its arrays are of {own}, its autoreset is same_step")
     if api == "rsl_rl" and render_mode is not None:
         raise ConfigError("render_mode=rgb_array: not with api=rsl_rl, which has no pictures")
-    wanted = own or arrays or "numpy"
-    _require_packages(api, wanted)
-    if render_mode is not None and (why_not := why_no_opengl()) is not None:
-        raise ConfigError(f"render_mode={render_mode}: {why_not}")
-    env = make_env(name, suite=suite, impl=impl, episode_length=episode_length, max_envs=num_envs)
-    warn_on_cpu(env)
-    module = importlib.import_module(f"gmijax.sim.adapters.to_{api}")
-    options = {"arrays": wanted, "autoreset": autoreset or "same_step"} if own is None else {}
-    if render_mode is not None:
-        options["render_mode"] = render_mode
-    return module.make(env, num_envs, **options)
 
 
 def _require(key: str, value: Any, allowed: tuple[Any, ...]) -> None:

@@ -7,7 +7,7 @@ k processes with n environments each see the samples of one process with k x n, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -22,7 +22,7 @@ from gmijax.types import Array, PRNGKey, PyTree
 T = TypeVar("T")
 
 _HEAD_START = 0x68656164
-"""Folded into a world's key for the length of its first episode."""
+"""Folded into an environment's key for the length of its first episode."""
 
 
 class EpisodeSums(NamedTuple):
@@ -47,11 +47,11 @@ class BatchState(NamedTuple):
     """State of N environments.
 
     Attributes:
-      env: all worlds; its `obs` [N, O] is the one after auto-reset, to act on next.
+      env: all environments; its `obs` [N, O] is the one after auto-reset, to act on next.
       return_sum: [N] float32, return of the running episode so far.
       term_sums: [N] float32 each, what every term has added to it.
-      head_start: [N] int32, steps by which the running episode of a world is shorter than its
-        time limit: the first one; else 0.
+      head_start: [N] int32, steps by which the running episode of an environment is shorter than
+        its time limit: the first one; else 0.
     """
 
     env: EnvState
@@ -68,12 +68,12 @@ class StepOutput(NamedTuple):
       reward: [N] float32.
       terminated: [N] bool, the task has ended.
       truncated: [N] bool, time ran out.
-      is_diverged: [N] bool, the world was ended because of a bad number (it counts as
+      is_diverged: [N] bool, the environment was ended because of a bad number (it counts as
         terminated).
       finished: the whole episodes that ended in this step; none that had a head start.
-      diverged: [] int32, worlds that were ended because of a bad number, by where it was:
+      diverged: [] int32, environments that were ended because of a bad number, by where it was:
         `gmijax.sim.divergence.sources`.
-      overflowed: [] int32, worlds for which a buffer was too small, by `OVERFLOWS`; empty if
+      overflowed: [] int32, environments for which a buffer was too small, by `OVERFLOWS`; empty if
         nothing can overflow.
     """
 
@@ -95,7 +95,7 @@ class BatchedEnv(NamedTuple):
       model: the physics model; pass it, or a randomised copy, to the functions.
       init: `(model, keys [N]) -> BatchState`; `env_keys` makes the keys, which it consumes.
       step: `(model, state, actions [N, A]) -> (BatchState, StepOutput)`, `advance` and `restart`.
-      advance: as `step`, but worlds that ended stay at their end.
+      advance: as `step`, but environments that ended stay at their end.
       restart: `(model, state) -> BatchState`, with new episodes where one has ended.
       overflows: the names in `StepOutput.overflowed`.
     """
@@ -110,7 +110,7 @@ class BatchedEnv(NamedTuple):
 
 
 def vectorise(env: Env) -> Env:
-    """The same environment for N worlds at once; they share the model, or most of its leaves."""
+    """A batch of N such environments; they share the model, or most of its leaves."""
     again = env.next_episode
     return env._replace(
         reset=jax.vmap(env.reset, in_axes=(env.model_axes, 0)),
@@ -122,19 +122,20 @@ def vectorise(env: Env) -> Env:
 def auto_reset(env: Env, model: PyTree, state: EnvState) -> EnvState:
     """Starts new random episodes where `state` [N] has ended; `env` is vectorised.
 
-    A world's key moves on only if the world is reset, so when other worlds end does not matter.
+    An environment's key moves on only if the environment is reset, so when other environments end
+    does not matter.
     """
     ended = state.terminated | state.truncated
     again = env.next_episode
     fresh = env.reset(model, state.key) if again is None else again(model, state)
-    return select_worlds(ended, fresh, state)
+    return select_envs(ended, fresh, state)
 
 
-def select_world(chosen: Array, new: T, old: T) -> T:
-    """`new` if the world is `chosen` [] bool, else `old`.
+def select_env(chosen: Array, new: T, old: T) -> T:
+    """`new` if the environment is `chosen` [] bool, else `old`.
 
     What has a method `where` selects for itself: `mjx.Data` in states of MuJoCo Playground. In
-    MJX-Warp it holds contacts that all worlds share.
+    MJX-Warp it holds contacts that all environments share.
     """
 
     def select(a: Any, b: Any) -> Any:
@@ -147,8 +148,8 @@ def _selects_itself(node: Any) -> bool:
     return callable(getattr(type(node), "where", None))
 
 
-select_worlds = jax.vmap(select_world)
-"""`select_world` of N worlds."""
+select_envs = jax.vmap(select_env)
+"""`select_env` of N environments."""
 
 
 def cut_first_episodes(spec: EnvSpec, before: BatchState, state: EnvState) -> EnvState:
@@ -185,11 +186,40 @@ def episode_statistics(
 
 
 def overflowed(env: Env, state: EnvState) -> dict[str, Array]:
-    """For worlds [N]: how many of them met a buffer that was too small, by `OVERFLOWS`."""
+    """For environments [N]: how many of them met a buffer that was too small, by `OVERFLOWS`."""
     if env.overflow is None:
         return {}
     counts = jnp.sum(jax.vmap(env.overflow)(state), axis=0, dtype=jnp.int32)
     return dict(zip(OVERFLOWS, counts, strict=True))
+
+
+def head_starts(spec: EnvSpec, keys: PRNGKey) -> Array:
+    """Steps [N] int32, at random up to a time limit, by which first episodes are shorter."""
+    own = jax.vmap(lambda key: jax.random.fold_in(key, _HEAD_START))(keys)
+    return jax.vmap(lambda key: jax.random.randint(key, (), 0, spec.episode_length))(own)
+
+
+def step_output(
+    env: Env, stepped: EnvState, bad: Mapping[str, Array], finished: EpisodeSums
+) -> StepOutput:
+    """What a step is for the caller.
+
+    Args:
+      env: of which the states are.
+      stepped: the states [N] after it, before any reset.
+      bad: [N] bool, which of them have diverged, by source.
+      finished: see `StepOutput`.
+    """
+    return StepOutput(
+        next_obs=stepped.obs,
+        reward=stepped.reward,
+        terminated=stepped.terminated,
+        truncated=stepped.truncated,
+        is_diverged=bad["any"],
+        finished=finished,
+        diverged={name: jnp.sum(where, dtype=jnp.int32) for name, where in bad.items()},
+        overflowed=overflowed(env, stepped),
+    )
 
 
 def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
@@ -197,19 +227,13 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
 
     Args:
       env: one of them, with a time limit.
-      random_ep_len: the first episode of a world is as long as if it had begun before, by a
-        random part of the time limit. Otherwise worlds that do not end by themselves all end in
-        the same step, and all samples of an update are of the same moment of an episode.
+      random_ep_len: the first episode of an environment is as long as if it had begun before, by a
+        random part of the time limit. Otherwise environments that do not end by themselves all end
+        in the same step, and all samples of an update are of the same moment of an episode.
 
     `init` raises ConfigError for more environments than `env.max_envs`.
     """
     batched = vectorise(env)
-
-    def head_starts(keys: PRNGKey) -> Array:
-        if not random_ep_len:
-            return jnp.zeros(keys.shape, jnp.int32)
-        own = jax.vmap(lambda key: jax.random.fold_in(key, _HEAD_START))(keys)
-        return jax.vmap(lambda key: jax.random.randint(key, (), 0, env.spec.episode_length))(own)
 
     def init(model: PyTree, keys: PRNGKey) -> BatchState:
         if env.max_envs is not None and len(keys) > env.max_envs:
@@ -218,7 +242,8 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
             )
         zero = jnp.zeros(keys.shape)
         terms = dict.fromkeys(env.spec.reward_terms, zero)
-        return BatchState(batched.reset(model, keys), zero, terms, head_starts(keys))
+        starts = head_starts(env.spec, keys) if random_ep_len else jnp.zeros(keys.shape, jnp.int32)
+        return BatchState(batched.reset(model, keys), zero, terms, starts)
 
     def advance(model: PyTree, state: BatchState, actions: Array) -> tuple[BatchState, StepOutput]:
         stepped = batched.step(model, state.env, actions)
@@ -227,19 +252,10 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
         bad = diverged_by_source(env, stepped)
         stepped = end_diverged(state.env, stepped, bad["any"])
         if env.next_episode is not None:  # What is carried on must be finite.
-            kept = select_worlds(bad["any"], state.env.task, stepped.task)
+            kept = select_envs(bad["any"], state.env.task, stepped.task)
             stepped = stepped._replace(task=kept)
         returns, terms, finished = episode_statistics(state, stepped)
-        output = StepOutput(
-            next_obs=stepped.obs,
-            reward=stepped.reward,
-            terminated=stepped.terminated,
-            truncated=stepped.truncated,
-            is_diverged=bad["any"],
-            finished=finished,
-            diverged={name: jnp.sum(where, dtype=jnp.int32) for name, where in bad.items()},
-            overflowed=overflowed(env, stepped),
-        )
+        output = step_output(env, stepped, bad, finished)
         ended = stepped.terminated | stepped.truncated
         head_start = jnp.where(ended, 0, state.head_start)
         return BatchState(stepped, returns, terms, head_start), output

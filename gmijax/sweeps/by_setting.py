@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.config.sweep import Ranking
-from gmijax.sweeps.kind import label_of
+from gmijax.sweeps.any_job import label_of
 
 T = TypeVar("T")
 Row = Mapping[str, Any]

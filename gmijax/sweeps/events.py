@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, TextIO
 
-from gmijax.sweeps.kind import AnyJob
+from gmijax.sweeps.any_job import AnyJob
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.progress import Progress
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from gmijax.errors import ConfigError, FolderLost, SweepFailed
 from gmijax.runs.folder import create_run, given_run
 from gmijax.runs.held import is_locked
-from gmijax.sweeps.kind import J
+from gmijax.sweeps.any_job import J
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.work import Work
 

@@ -12,7 +12,7 @@ from gmijax.config import BackendName, TrainConfig
 from gmijax.config.schema import flatten, to_dict
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
-from gmijax.sweeps.kind import label_of
+from gmijax.sweeps.any_job import label_of
 from gmijax.sweeps.progress import Progress, State
 from gmijax.sweeps.slots import Slot
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import signal
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -177,16 +177,7 @@ def _profile(
                 inner.handle(signal.SIGTERM)
 
         try:
-            plan = plan_slots(settings, host.machine, {job.config.plan.backend})
-            slots = SlotPool([Site(plan, host.machine)])
-            try:
-                host.open(plan, paths)
-                kind = TrainingKind(settings, paths)
-                Scheduler(jobs, Study[Job](), kind, settings, paths, slots, [host], tick).run(
-                    inner
-                )
-            finally:
-                host.shut()
+            _train(jobs, settings, paths, host, tick, inner)
         except NodeLost:
             raise
         except JobInterrupted:
@@ -198,6 +189,24 @@ def _profile(
             failed = next((j.progress.error for j in jobs if j.progress.error), None)
             return NotRunnable(failed or f"no end within {limit_s:.0f} s", limit_s)
         return Measured(rate / count, _memory_mib(paths, jobs), window.iteration_s)
+
+
+def _train(
+    jobs: list[Job],
+    settings: SweepConfig,
+    paths: SweepPaths,
+    host: Host,
+    tick: Callable[[], None],
+    signals: StopSignals,
+) -> None:
+    """Runs the jobs at the same time; `tick` is called meanwhile."""
+    plan = plan_slots(settings, host.machine, {job.config.plan.backend for job in jobs})
+    slots, kind = SlotPool([Site(plan, host.machine)]), TrainingKind(settings, paths)
+    try:
+        host.open(plan, paths)
+        Scheduler(jobs, Study[Job](), kind, settings, paths, slots, [host], tick).run(signals)
+    finally:
+        host.shut()
 
 
 def _copy(job: Job, seed: int, num_timesteps: int) -> Job:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from gmijax.config import TrainConfig
 from gmijax.config.sweep import Ranking, SweepConfig
 from gmijax.errors import ConfigError
 from gmijax.runs.history import number_in
-
-if TYPE_CHECKING:
-    from gmijax.sweeps.jobs import Job
 
 _RETURN, _EVALUATED = "return", "eval/return"
 _EVALUATIONS = "eval/"
@@ -65,14 +63,14 @@ def value_of(curve: Sequence[tuple[int, float]], ranking: Ranking) -> float:
     return sum(last) / len(last)
 
 
-def with_objective(sweep: SweepConfig, jobs: Sequence[Job]) -> SweepConfig:
+def with_objective(sweep: SweepConfig, configs: Sequence[TrainConfig]) -> SweepConfig:
     """The settings with the key that jobs are ranked by.
 
     Raises:
       ConfigError: jobs are to be ranked by evaluations that they do not make.
     """
     objective = sweep.objective.removeprefix("window/")  # Its own is taken in any case.
-    all_evaluate = all(job.config.eval.every is not None for job in jobs)
+    all_evaluate = all(config.eval.every is not None for config in configs)
     if objective == "auto":
         objective = _EVALUATED if all_evaluate else _RETURN
     if objective.startswith(_EVALUATIONS) and not all_evaluate:
@@ -82,9 +80,9 @@ def with_objective(sweep: SweepConfig, jobs: Sequence[Job]) -> SweepConfig:
     return dataclasses.replace(sweep, objective=objective)
 
 
-def why_not_comparable(jobs: Sequence[Job], sweep: SweepConfig) -> str | None:
+def why_not_comparable(configs: Sequence[TrainConfig], sweep: SweepConfig) -> str | None:
     """A warning if jobs are ranked by returns of different rewards, else None."""
-    first, *others = (dict(job.config.env.rewards) for job in jobs)
+    first, *others = (dict(config.env.rewards) for config in configs)
     if sweep.objective not in (_RETURN, _EVALUATED) or all(other == first for other in others):
         return None
     return (

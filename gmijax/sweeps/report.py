@@ -18,8 +18,8 @@ from rich.table import Table
 from gmijax.config.sweep import Ranking
 from gmijax.runs.folder import write_bytes, write_json, write_text
 from gmijax.runs.held import OpenFolder
+from gmijax.sweeps.any_job import AnyJob, label_of, trainings_per_hour
 from gmijax.sweeps.by_setting import Row, SeedSummary, grouped, place_of, seed_summary, settings_of
-from gmijax.sweeps.kind import AnyJob, label_of, trainings_per_hour
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.progress import State
 from gmijax.version import __version__

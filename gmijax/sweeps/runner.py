@@ -18,10 +18,10 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RUNS, given_run, read_json, write_json
 from gmijax.runs.held import OpenFolder, locked
 from gmijax.supervise.run_gmis import StopSignals, stop_signals
+from gmijax.sweeps.any_job import J
 from gmijax.sweeps.events import JobEvents
 from gmijax.sweeps.folder import errors_of_files, opened_folder
 from gmijax.sweeps.host import LocalHost
-from gmijax.sweeps.kind import J
 from gmijax.sweeps.nodes import Host, nodes_of
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.report import JobsReport
@@ -110,15 +110,20 @@ def _run(
     wrong = report.end("failed" if failed else "completed")
     job_events.end(report.data)
     print_outcome(console, report.data, work.ranking, paths, view.line())
-    if failed:
-        first = failed[0]
-        text = f"{len(failed)} of {len(jobs)} jobs failed; job {first.number}: "
-        wrong = f"{text}{first.progress.error}{'' if wrong is None else f'; {wrong}'}"
-    if wrong is not None:
-        raise SweepFailed(wrong)
+    _require_success(failed, len(jobs), wrong)
     if report.data["ranking"]:
         print_next(console, work.next_step(paths, report.data["ranking"][0]))
     return SweepResult(paths.root, report.data)
+
+
+def _require_success(failed: Sequence[J], num_jobs: int, wrong: str | None) -> None:
+    """Raises SweepFailed for jobs that have failed, and for what else is `wrong`."""
+    if failed:
+        first = failed[0]
+        text = f"{len(failed)} of {num_jobs} jobs failed; job {first.number}: "
+        wrong = f"{text}{first.progress.error}{'' if wrong is None else f'; {wrong}'}"
+    if wrong is not None:
+        raise SweepFailed(wrong)
 
 
 def _run_jobs(

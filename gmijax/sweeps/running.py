@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol
 
 from gmijax.clock import running_s
+from gmijax.sweeps.any_job import J
 from gmijax.sweeps.children import ChildStatus
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.slots import Slot
 
-if TYPE_CHECKING:
-    from gmijax.sweeps.kind import AnyJob, Reader
 
-J = TypeVar("J", bound="AnyJob")
+class Reader(Protocol):
+    """Follows how far a job is."""
+
+    def new(self) -> list[dict[str, Any]]:
+        """Lines of metrics that came since the last call."""
+        ...
 
 
 class JobOutcome(NamedTuple):

@@ -14,9 +14,10 @@ from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.folder import add_event
 from gmijax.runs.held import is_locked
 from gmijax.supervise.run_gmis import StopSignals
+from gmijax.sweeps.any_job import J
 from gmijax.sweeps.children import ChildStatus
 from gmijax.sweeps.host import ChildStart
-from gmijax.sweeps.kind import J, Kind, Limiter
+from gmijax.sweeps.kind import Kind, Limiter
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.running import JobOutcome, Running

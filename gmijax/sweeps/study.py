@@ -10,7 +10,7 @@ from typing import Any, Generic
 
 from gmijax.config.sweep import JobsConfig
 from gmijax.errors import ConfigError
-from gmijax.sweeps.kind import J
+from gmijax.sweeps.any_job import J
 from gmijax.sweeps.space import Interval, Space, as_text
 
 MakeJob = Callable[[int, Mapping[str, str]], J]

@@ -47,6 +47,11 @@ class SweepWork(Work[Job]):
         return cast("SweepConfig", self.settings)
 
     @property
+    def configs(self) -> list[TrainConfig]:
+        """Those of the jobs."""
+        return [job.config for job in self.jobs]
+
+    @property
     def on_cpu(self) -> bool:
         """See `Work`."""
         return all(job.config.plan.backend == "cpu" for job in self.jobs)
@@ -71,7 +76,7 @@ class SweepWork(Work[Job]):
     def require_runnable(self, sites: Sequence[Site]) -> None:
         """See `Work`."""
         require_placeable(self.jobs, min(site.plan.layout.num_gpus for site in sites))
-        require_packable(with_objective(self.ranking, self.jobs), self.jobs)
+        require_packable(with_objective(self.ranking, self.configs), self.jobs)
 
     def decided(
         self, hosts: Sequence[Host], console: Console, signals: StopSignals, scratch: Path | None
@@ -105,7 +110,7 @@ class SweepWork(Work[Job]):
     def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """See `Work`."""
         del sites
-        warning = why_not_comparable(self.jobs, self.ranking)
+        warning = why_not_comparable(self.configs, self.ranking)
         return () if warning is None else (warning,)
 
 
@@ -158,5 +163,5 @@ def run_sweep(work: SweepWork, *, show: Show = False) -> SweepResult:
         work, jobs=jobs, make_job=lambda number, chosen: pinned(make_job(number, chosen))
     )
     if jobs:
-        work = replace(work, settings=with_objective(work.ranking, jobs))
+        work = replace(work, settings=with_objective(work.ranking, [job.config for job in jobs]))
     return run_work(work, show=show)

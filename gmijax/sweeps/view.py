@@ -11,7 +11,7 @@ from rich.text import Text
 
 from gmijax.config.sweep import Ranking
 from gmijax.control.display import LiveDisplay, bar, clock
-from gmijax.sweeps.kind import AnyJob, label_of, trainings_per_hour
+from gmijax.sweeps.any_job import AnyJob, label_of, trainings_per_hour
 from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import shown
 

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from gmijax.config.sweep import Ranking
 from gmijax.control.console import nearby, print_reasons
-from gmijax.sweeps.kind import J
+from gmijax.sweeps.any_job import J
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.report import tables
 from gmijax.sweeps.slots import Site

@@ -14,7 +14,8 @@ from gmijax.config import ClusterConfig
 from gmijax.config.sweep import JobsConfig, Ranking
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.run_gmis import StopSignals
-from gmijax.sweeps.kind import J, Kind, Limiter
+from gmijax.sweeps.any_job import J
+from gmijax.sweeps.kind import Kind, Limiter
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.progress import State

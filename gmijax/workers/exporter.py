@@ -28,12 +28,12 @@ def _run(link: ChildLink) -> None:
     # jax starts here, in the environment that the plan prepared.
     from gmijax.deploy.files import onnx_content, stablehlo_content
     from gmijax.deploy.trained import trained_policy
-    from gmijax.sim.randomize import make_worlds
+    from gmijax.sim.randomize import make_envs
 
     link.beat("compiling", 0)
     policy = trained_policy(checkpoint)
     # Only asked for names: nothing is simulated.
-    env = make_worlds(env_config, "jax", seed=0, first_env=0, num_envs=1)
+    env = make_envs(env_config, "jax", seed=0, first_env=0, num_envs=1)
     metadata = {**policy.metadata, **names_of(env), **_robot(env_config, env, policy.obs_size)}
     paths = ExportPaths(link.run.root)
     if config.format in ("onnx", "all"):

@@ -1,7 +1,7 @@
 """Main of the page-writing child of `gmijax.play`, `page_writer.py PLAY_FOLDER`. No jax here.
 
-Turns the trajectories of the filmed worlds into a page that shows them in 3D in a browser. The
-page holds the geometry, the motion and viser's viewer, and loads nothing from anywhere.
+Turns the trajectories of the filmed environments into a page that shows them in 3D in a browser.
+The page holds the geometry, the motion and viser's viewer, and loads nothing from anywhere.
 """
 
 from __future__ import annotations

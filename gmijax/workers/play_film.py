@@ -143,21 +143,21 @@ def compose(tiles: list[Image], grid: tuple[int, int]) -> Image:
 def frames(
     trajectory: Trajectory, stage: Stage, grid: tuple[int, int], stride: int
 ) -> Iterator[Image]:
-    """Every `stride`-th step as a picture; a world whose episode is over is dimmed."""
+    """Every `stride`-th step as a picture; an environment whose episode is over is dimmed."""
     captions, last = Captions(trajectory.labels, trajectory.lines), dict[int, Image]()
     for step in range(0, len(trajectory.qpos), stride):
         tiles: list[Image] = []
-        for world, length in enumerate(trajectory.lengths):
-            if world not in last:
-                picture = stage.picture(trajectory.qpos[min(step, length), world])
+        for index, length in enumerate(trajectory.lengths):
+            if index not in last:
+                picture = stage.picture(trajectory.qpos[min(step, length), index])
                 if step > length:
                     picture = (picture * _ENDED_BRIGHTNESS).astype(np.uint8)
-                picture = captions.label(world, picture)
+                picture = captions.label(index, picture)
                 if step > length:
-                    last[world] = picture
+                    last[index] = picture
                 tiles.append(picture)
             else:
-                tiles.append(last[world])
+                tiles.append(last[index])
         yield captions.below(compose(tiles, grid), step * trajectory.control_dt_s)
 
 

@@ -35,33 +35,18 @@ def _run(link: ChildLink) -> None:
     import jax
 
     from gmijax.learning.algorithm import saved_state
-    from gmijax.learning.episodes import EpisodeOptions, run_episodes
     from gmijax.learning.learner import make_learner
     from gmijax.sim.camera import check_camera, choose_camera
-    from gmijax.sim.randomize import make_worlds
-    from gmijax.sim.trajectory import MOST_RECORDED
+    from gmijax.sim.randomize import make_envs
 
     impl = _impl(config, checkpoint, env_config)
     # At its full range: what was learnt in the end is what counts.
     played = dataclasses.replace(env_config, randomize=config.randomize, curriculum="off")
-    env = make_worlds(played, impl, seed=config.seed, first_env=0, num_envs=config.num_envs)
+    env = make_envs(played, impl, seed=config.seed, first_env=0, num_envs=config.num_envs)
     check_camera(env.mj_model, config.camera, env.spec.name)
     learner = make_learner(env.spec, algo)
     state = saved_state(checkpoint, learner, env.spec.obs_size)
-    link.beat("compiling", 0)
-    episodes = run_episodes(
-        env,
-        learner,
-        state,
-        EpisodeOptions(
-            num_envs=config.num_envs,
-            num_shown=min(config.num_envs, max(config.num_filmed, MOST_RECORDED)),
-            seed=config.seed,
-            deterministic=config.deterministic,
-            max_steps=config.max_steps,
-        ),
-        lambda chunks: link.beat("running", chunks),
-    )
+    episodes = _episodes(config, env, learner, state, link)
     paths = PlayPaths(link.run.root)
     env_steps = CheckpointMeta.read(checkpoint).env_steps
     _write_trajectory(paths, env, episodes, config, env_steps)
@@ -79,6 +64,23 @@ def _run(link: ChildLink) -> None:
     if (robot := robot_of(env_config)) is not None:
         about["walking"] = _walk(config, env_config, robot, impl, link, learner, state)
         write_json(paths.returns, {**outcome, **about})
+
+
+def _episodes(
+    config: PlayConfig, env: Env, learner: Learner, state: TrainState, link: ChildLink
+) -> Episodes:
+    from gmijax.learning.episodes import EpisodeOptions, run_episodes
+    from gmijax.sim.trajectory import MOST_RECORDED
+
+    link.beat("compiling", 0)
+    options = EpisodeOptions(
+        num_envs=config.num_envs,
+        num_shown=min(config.num_envs, max(config.num_filmed, MOST_RECORDED)),
+        seed=config.seed,
+        deterministic=config.deterministic,
+        max_steps=config.max_steps,
+    )
+    return run_episodes(env, learner, state, options, lambda chunks: link.beat("running", chunks))
 
 
 def _walk(

@@ -47,12 +47,12 @@ def _run(link: ChildLink) -> dict[str, Any]:
 
     from gmijax.collection.collectors import CollectorContext
     from gmijax.devices import describe_device
-    from gmijax.learning.start import worlds_of
+    from gmijax.learning.start import envs_of
     from gmijax.selfcheck import check_share
     from gmijax.sim.wrappers import training_env
 
     check_share(plan, link.gmi)
-    env = training_env(worlds_of(config, rank))
+    env = training_env(envs_of(config, rank))
     policy = _policy(config, env.spec)
     first, num_unrolls = _unrolls(config, rank, len(group.gmis)) if own == SIMULATOR else (0, 0)
     with ExitStack() as held:

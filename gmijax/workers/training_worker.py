@@ -28,6 +28,7 @@ from gmijax.supervise.job_kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups
 
 if TYPE_CHECKING:
     from gmijax.baselines.tdg_ex import RemoteIteration
+    from gmijax.channels.build import ChannelTopology
     from gmijax.collectives.interface import Communicator
     from gmijax.learning.learner import Learner
     from gmijax.sim.wrappers import BatchedEnv
@@ -165,16 +166,11 @@ def _run_asynchronous(
     agents, trainers = groups_of(plan)
     sizes = num_weights(env.spec, config.algo), num_counts(env)
     registers = open_job_registers(required_fd(ENV_REGISTERS_FD), *sizes, len(agents.gmis))
-    topology, (nodes, listener) = topology_of(plan), inherited_nodes()
+    nodes, listener = inherited_nodes()
     if nodes is not None:
-        addresses = {
-            (agent, trainer): at
-            for (trainer, agent), at in nodes.calls.items()
-            if trainer in trainers.gmis
-        }
-        topology = replace(topology, addresses=addresses, secret=nodes.token)
         at_leader = agents.gmis, trainers.gmis[0], held
         registers = over_nodes(registers, sizes, nodes, link.gmi, *at_leader)
+    topology = _topology(plan, trainers, nodes)
     channels = config.channel, topology, link.gmi, required_fd(ENV_CHANNELS_FD)
     if link.gmi in agents.gmis:
         if listener is not None:
@@ -193,13 +189,26 @@ def _run_asynchronous(
     return trainer.run() | exchange_used(plan, comm)
 
 
+def _topology(plan: Plan, trainers: Group, nodes: NodeAddresses | None) -> ChannelTopology:
+    """Who sends experience to whom, and to which address on another node."""
+    topology = topology_of(plan)
+    if nodes is None:
+        return topology
+    addresses = {
+        (agent, trainer): at
+        for (trainer, agent), at in nodes.calls.items()
+        if trainer in trainers.gmis
+    }
+    return replace(topology, addresses=addresses, secret=nodes.token)
+
+
 def environments(config: TrainConfig, place: int) -> BatchedEnv:
     """The environments of the GMI that is number `place` of those that simulate."""
-    from gmijax.learning.start import worlds_of
+    from gmijax.learning.start import envs_of
     from gmijax.sim.wrappers import training_env
 
     random_ep_len = config.algo.init_at_random_ep_len
-    return training_env(worlds_of(config, place), random_ep_len=random_ep_len)
+    return training_env(envs_of(config, place), random_ep_len=random_ep_len)
 
 
 def _trainers_communicator(

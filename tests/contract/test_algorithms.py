@@ -25,7 +25,6 @@ from gmijax.learning.checkpoint import (
     checkpoint_meta,
     finish_checkpoint,
     has_replay,
-    on_host,
     restore_envs,
     restore_learner,
     restore_replay,
@@ -35,6 +34,7 @@ from gmijax.learning.checkpoint_saver import CheckpointPart, CheckpointSaver
 from gmijax.learning.episode_window import Standing
 from gmijax.learning.learner import Learner, TrainState, acting_weights
 from gmijax.learning.policy_file import save_policy
+from gmijax.learning.saved_arrays import on_host
 from gmijax.learning.start import begin_episodes
 from gmijax.runs.folder import RunPaths, write_json
 

@@ -45,12 +45,12 @@ def test_a_passive_robot_gains_no_energy(task: CompiledTask):
 
 
 def energy(mj_model: mujoco.MjModel, state: physics.PhysicsState) -> np.ndarray:
-    """Potential and kinetic energy of worlds, joules [NUM_STARTS, 2]."""
+    """Potential and kinetic energy of environments, joules [NUM_STARTS, 2]."""
     qpos, qvel = np.asarray(state.qpos), np.asarray(state.qvel)
     data, found = mujoco.MjData(mj_model), []
     held = mj_model.body_gravcomp * mj_model.body_mass
-    for world in range(NUM_STARTS):
-        data.qpos, data.qvel = qpos[world], qvel[world]
+    for index in range(NUM_STARTS):
+        data.qpos, data.qvel = qpos[index], qvel[index]
         mujoco.mj_fwdPosition(mj_model, data)
         mujoco.mj_fwdVelocity(mj_model, data)
         mujoco.mj_energyPos(mj_model, data)
@@ -74,7 +74,7 @@ def test_bodies_do_not_sink_into_each_other(task: CompiledTask):
 
 
 def depth(mj_model: mujoco.MjModel, qpos: np.ndarray) -> float:
-    """How deep the deepest contact of worlds `qpos` [N, nq] is, metres."""
+    """How deep the deepest contact of environments `qpos` [N, nq] is, metres."""
     data, deepest = mujoco.MjData(mj_model), 0.0
     for row in qpos:
         data.qpos = row

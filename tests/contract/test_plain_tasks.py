@@ -1,7 +1,7 @@
 """Every task is the same on numpy as on JAX: its starts, and what it makes of the same physics.
 
-MuJoCo in C moves a world; the task's functions then run once in numpy and once in JAX, compiled,
-on the positions, velocities, forces and sensors that it left.
+MuJoCo in C moves an environment; the task's functions then run once in numpy and once in JAX,
+compiled, on the positions, velocities, forces and sensors that it left.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ TOLERANCE = 2e-4
 class Recorded(CPhysics):
     """MuJoCo in C, of which JAX gets what it has computed: that is the `model` of a step."""
 
-    def __init__(self, world: CPhysics) -> None:
-        super().__init__(world.mj_model, world.substeps)
+    def __init__(self, sim: CPhysics) -> None:
+        super().__init__(sim.mj_model, sim.substeps)
 
     def start(self, qpos: Any, qvel: Any) -> PhysicsState:
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
@@ -59,14 +59,14 @@ def in_jax(task: str, monkeypatch: pytest.MonkeyPatch) -> tuple[Env, list[Any]]:
     signals: list[Any] = []
     plain = PlainEnv(EnvConfig(name=task, episode_length=None))
 
-    class World(Recorded):
+    class Watched(Recorded):
         def step(self, model: Any, state: Any, ctrl: Any, *read: Any) -> Any:
             after, (ctrl, found) = super().step(model, state, ctrl, *read)
             signals.append(ctrl)
             return after, found
 
     with monkeypatch.context() as patch:
-        patch.setattr(simulators, "load", lambda *_, **__: World(plain.physics))
+        patch.setattr(simulators, "load", lambda *_, **__: Watched(plain.physics))
         module = __import__(TASKS[task], fromlist=["make"])
         return module.make(), signals
 
@@ -151,7 +151,7 @@ def assert_trees_equal(ours: Any, theirs: Any) -> None:
 
 
 def test_the_player_imports_neither_jax_nor_hydra():
-    """In a fresh interpreter, with a world of every task made and moved."""
+    """In a fresh interpreter, with an environment of every task made and moved."""
     program = """
 import sys
 import numpy as np

@@ -26,7 +26,7 @@ from gmijax.player.joystick import ROBOTS as WALKERS
 from gmijax.player.joystick import Ground, Readings
 from gmijax.player.walking import Recording, measure
 from gmijax.sim.interface import Env
-from gmijax.sim.randomize import make_worlds, randomized
+from gmijax.sim.randomize import make_envs, randomized
 from gmijax.sim.registry import make_env, require_env
 from gmijax.sim.robot_models import has_randomizer, models_of
 from gmijax.sim.robots import ROBOT_SETTINGS
@@ -41,7 +41,7 @@ pytestmark = pytest.mark.timeout(600)
 
 
 class Walked(NamedTuple):
-    """Go1, randomised, in worlds that have all started alike, and its first steps."""
+    """Go1, randomised, in environments that have all started alike, and its first steps."""
 
     env: Env
     step: Callable[..., tuple[BatchState, StepOutput]]
@@ -64,7 +64,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def walked(models: None) -> Walked:
     config = gmijax.compose("env=go1", "env.randomize=on", "env.settings.push=1").env
     require_env(config)
-    env = make_worlds(config, "jax", seed=SEED, first_env=0, num_envs=NUM_ENVS)
+    env = make_envs(config, "jax", seed=SEED, first_env=0, num_envs=NUM_ENVS)
     batch = training_env(env)
     alike = jax.random.split(jax.random.key(0), 1)[jnp.zeros(NUM_ENVS, int)]
     states = [jax.jit(batch.init)(env.model, alike)]
@@ -102,7 +102,7 @@ def test_films_know_the_command_that_the_policy_sees(walked: Walked) -> None:
     np.testing.assert_allclose(command, state.obs[:, 45:48])
 
 
-def test_each_world_has_the_model_that_playground_draws(walked: Walked) -> None:
+def test_each_environment_has_the_model_that_playground_draws(walked: Walked) -> None:
     start, end = (
         np.asarray(jax.vmap(walked.env.qpos)(state.env))
         for state in (walked.states[0], walked.states[-1])
@@ -119,7 +119,7 @@ def test_each_world_has_the_model_that_playground_draws(walked: Walked) -> None:
     }
 
 
-def test_several_gmis_have_the_worlds_of_one(walked: Walked) -> None:
+def test_several_gmis_have_the_environments_of_one(walked: Walked) -> None:
     second = randomized(walked.env, {}, seed=SEED, first_env=2, num_envs=2)
     for leaf, values in walked.env.model.items():
         np.testing.assert_array_equal(second.model[leaf], values[2:])

@@ -95,7 +95,7 @@ def test_time_limit_truncates_and_a_new_random_episode_begins(task: CompiledTask
     assert int(out.finished.length_sum) == alive.sum() * EPISODE_LENGTH
 
 
-def test_a_fatal_position_terminates_its_own_world_only(task: CompiledTask):
+def test_a_fatal_position_terminates_its_own_environment_only(task: CompiledTask):
     hazard = CASES[task.env.spec.name].hazard
     if hazard is None:
         pytest.skip("only time ends this task")

@@ -180,7 +180,7 @@ def _inject_in_training(faults: Faults) -> None:
 
     from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
     from gmijax.collectives.program import ProgramStep
-    from gmijax.learning import checkpoint
+    from gmijax.learning import checkpoint, saved_arrays
     from gmijax.learning.throughput import ThroughputMeter
     from gmijax.learning.training_log import TrainingLog
 
@@ -194,7 +194,7 @@ def _inject_in_training(faults: Faults) -> None:
         if path.name.endswith(".removed") and path.exists():
             faults.at("removing")
 
-    save, iterate = checkpoint._save, ProgramStep.__call__
+    save, iterate = saved_arrays.save, ProgramStep.__call__
 
     def save_half(folder: Path, tree: Any) -> None:
         save(folder, tree)
@@ -216,7 +216,7 @@ def _inject_in_training(faults: Faults) -> None:
     _before(TrainingLog, "write", lambda *_: faults.at("report"))
     _before(ThroughputMeter, "measure", lambda *_: faults.at("measuring"))
     _before(checkpoint, "_sync", synced)
-    checkpoint._save = save_half
+    saved_arrays.save = save_half
     checkpoint.shutil = _Recorded(checkpoint.shutil, removed)
     ProgramStep.__call__ = iterate_poisoned
 

@@ -1,4 +1,4 @@
-"""A job whose worlds have models of their own, and the example of a task in a file."""
+"""A job whose environments have models of their own, and the example of a task in a file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from training_jobs import TINY, train
 EXAMPLE = Path(__file__).parents[2] / "examples" / "custom_task.py"
 
 
-def test_the_example_trains_in_randomised_worlds(tmp_path: Path) -> None:
+def test_the_example_trains_in_randomised_environments(tmp_path: Path) -> None:
     done = train(
         *(f"env={EXAMPLE}:make", *TINY[1:], "num_timesteps=128"),
         *(

@@ -137,7 +137,7 @@ def test_rewards_actions_and_metrics_of_an_episode():
     assert {k: float(v) for k, v in last.finished.metric_sums.items()} == {"double": 24.0}
 
 
-def test_a_world_starts_over_where_it_began_and_keeps_their_info():
+def test_an_environment_starts_over_where_it_began_and_keeps_their_info():
     """As with the automatic resets of Brax and Playground."""
     states = [state.env for state, _ in unrolled(Counter(), *[0.0] * 5)]
     first, before, after, then = (states[i] for i in (0, 3, 4, 5))
@@ -151,7 +151,7 @@ def test_a_world_starts_over_where_it_began_and_keeps_their_info():
     np.testing.assert_array_equal(then.task.info["rng"], first.task.info["rng"])
 
 
-def test_a_world_that_diverged_keeps_their_info_of_one_step_earlier():
+def test_an_environment_that_diverged_keeps_their_info_of_one_step_earlier():
     (state, _), (_, out), (last, _) = unrolled(Counter(), 0.0, -1.0, 0.0)[1:]
     assert state.env.task.info["steps"].tolist() == [1.0] * NUM_ENVS
     assert out.is_diverged.all()
@@ -281,7 +281,7 @@ def test_states_of_playground_in_warp_start_over_one_by_one(times: int):
     env = action_repeat(from_playground(WarpBall(), name="ball"), times)
     batch = training_env(env)
     state = batch.init(batch.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
-    assert state.env.physics.data._impl.contact__dist.shape == (4,), "all worlds share it"
+    assert state.env.physics.data._impl.contact__dist.shape == (4,), "all environments share it"
     first, step, landed = state.env.obs, jax.jit(batch.step), np.zeros(NUM_ENVS, int)
     for _ in range(150 // times):
         before = state

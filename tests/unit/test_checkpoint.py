@@ -18,13 +18,13 @@ from gmijax.cli.compose import compose
 from gmijax.errors import ConfigError
 from gmijax.learning.checkpoint import (
     finish_checkpoint,
-    on_host,
     restore_envs,
     restore_learner,
     save_envs,
     save_learner,
 )
 from gmijax.learning.learner import TrainState, learner_shapes
+from gmijax.learning.saved_arrays import on_host
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.resume import (
     CheckpointMeta,

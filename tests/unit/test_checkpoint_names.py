@@ -12,9 +12,9 @@ from supervision import save, save_meta
 from gmijax.cli.compose import build, compose
 from gmijax.config import PlayConfig
 from gmijax.control.films import filmed
-from gmijax.control.restarts import clear_unfinished, keep_logs
+from gmijax.control.run_folder import clear_unfinished, keep_logs
 from gmijax.control.summary import train_outcome
-from gmijax.deploy.playing import open_run
+from gmijax.deploy.trained_run import open_run
 from gmijax.errors import ConfigError
 from gmijax.learning.checkpoint import finish_checkpoint
 from gmijax.runs.dataset import DataPaths

@@ -151,7 +151,7 @@ def stats_of(folder: Path) -> CollectionStats:
     return CollectionStats(link, "point_mass", N * T)
 
 
-def test_too_many_bad_worlds_end_serving_and_the_term_is_named(tmp_path: Path):
+def test_too_many_bad_environments_end_serving_and_the_term_is_named(tmp_path: Path):
     stats, counts = stats_of(tmp_path), no_counts(point_mass().spec)
     few = {"any": jnp.asarray(TOLERATED_STEPS), "reward/near": jnp.asarray(TOLERATED_STEPS)}
     stats.add(counts._replace(diverged=counts.diverged | few))

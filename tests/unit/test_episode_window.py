@@ -27,8 +27,8 @@ def sums(lengths: np.ndarray) -> EpisodeSums:
     return EpisodeSums(float(len(lengths)), -total, total, {"time": -total}, {"ends": total})
 
 
-class Worlds:
-    """Worlds whose steps cost 1; a third of all episodes ends early, the others at LIMIT."""
+class Envs:
+    """Environments whose steps cost 1; a third of all episodes ends early, the others at LIMIT."""
 
     def __init__(self, count: int, *, head_starts: bool = False) -> None:
         self.count, self.random = count, np.random.default_rng(0)
@@ -61,10 +61,10 @@ MEAN = -(np.mean(range(*SHORT)) + 2 * LIMIT) / 3
 def test_a_full_window_has_episodes_of_every_length_as_often_as_they_occur(
     count: int, head_starts: bool
 ) -> None:
-    worlds, window = Worlds(count, head_starts=head_starts), EpisodeWindow(LIMIT * count)
+    envs, window = Envs(count, head_starts=head_starts), EpisodeWindow(LIMIT * count)
     full, first, early = [], None, None
     for iteration in range(1, 6 * LIMIT // UNROLL * max(1, 64 // count)):
-        window.add(worlds.iterate(), UNROLL * count)
+        window.add(envs.iterate(), UNROLL * count)
         standing = window.standing()
         early = early or standing.mean_return
         if standing.is_full:
@@ -103,26 +103,26 @@ def test_the_short_window_is_the_fewest_iterations_with_a_hundred_episodes() -> 
 
 def test_a_window_goes_on_after_a_resume_as_if_nothing_had_been(tmp_path: Path) -> None:
     config, count = compose("env=ant"), 64
-    worlds, whole = Worlds(count), EpisodeWindow(LIMIT * count)
+    envs, whole = Envs(count), EpisodeWindow(LIMIT * count)
     run, lines = RunPaths(tmp_path), []
     write_json(run.config, to_dict(config))
     for iteration in range(3 * LIMIT // UNROLL):
         if iteration == 60:
             save_episodes(run, 60, config, whole.state())
             standing = whole.standing()
-        whole.add(worlds.iterate(), UNROLL * count)
+        whole.add(envs.iterate(), UNROLL * count)
         lines.append(whole.line())
     checkpoint = finish_checkpoint(run, checkpoint_meta(config, 60, 1, standing))
     assert CheckpointMeta.read(checkpoint).window_full
     assert CheckpointMeta.read(checkpoint).mean_return == standing.mean_return
 
     resume = f"run.resume={checkpoint}"
-    again = Worlds(count)
-    # Worlds that begin anew: what was measured counts, a new first time limit does not.
+    again = Envs(count)
+    # Environments that begin anew: what was measured counts, a new first time limit does not.
     resumed = first_window(compose("env=ant", resume), LIMIT * count, 0, None)
     assert resumed.standing() == standing._replace(is_full=False)
     resumed.restore(
-        whole.state() | json.loads((checkpoint / "episodes.json").read_text()), worlds_go_on=True
+        whole.state() | json.loads((checkpoint / "episodes.json").read_text()), envs_go_on=True
     )
     for iteration in range(3 * LIMIT // UNROLL):
         episodes = again.iterate()
@@ -147,6 +147,6 @@ def test_a_checkpoint_whose_window_is_not_full_is_best_only_among_its_like(tmp_p
     assert best_checkpoint(run.root) == run.checkpoint(1)
     for env_steps, mean in ((3, -138.0), (4, -120.0), (5, -130.0)):
         save(env_steps, mean, True)
-    save(6, -6.0, False)  # Worlds that began anew.
+    save(6, -6.0, False)  # Environments that began anew.
     assert best_checkpoint(run.root) == run.checkpoint(4)
     assert sorted(int(path.name) for path in run.checkpoints.iterdir()) == [4, 6]

@@ -47,7 +47,7 @@ def test_every_task_is_registered_once_with_its_time_limit():
         assert gym.spec(f"gmijax/{task}").max_episode_steps == limit
 
 
-def test_many_worlds_by_id():
+def test_many_environments_by_id():
     envs: Any = gym.make_vec(ID, num_envs=3, autoreset="next_step")
     assert envs.num_envs == 3
     assert envs.metadata["autoreset_mode"] is gym.vector.AutoresetMode.NEXT_STEP
@@ -60,7 +60,7 @@ def test_many_worlds_by_id():
 
 
 @pytest.mark.filterwarnings("ignore:.*observation space (min|max)imum value is -?infinity")
-def test_one_world_by_id_passes_the_checker_of_gymnasium():
+def test_one_environment_by_id_passes_the_checker_of_gymnasium():
     env = gym.make(ID, max_episode_steps=4)
     check_env(env.unwrapped, skip_render_check=True)
     env.reset(seed=0)

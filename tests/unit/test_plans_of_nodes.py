@@ -14,7 +14,7 @@ from gmijax import compose
 from gmijax.collectives.nodes.rendezvous import NodeAddresses
 from gmijax.collectives.strategies import stages
 from gmijax.config import PlanConfig, ReduceConfig, TrainConfig
-from gmijax.control.restarts import with_nodes_left
+from gmijax.control.reduced_plan import with_nodes_left
 from gmijax.errors import (
     BackendUnavailable,
     ConfigError,

@@ -1,4 +1,4 @@
-"""Whole episodes on a world that can be worked out by hand."""
+"""Whole episodes on an environment that can be worked out by hand."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SPEC = EnvSpec("counter", 1, 1, 0.1, TIME_LIMIT, ("plus", "minus"))
 
 
 def counting_env(reward: float = 1.0, per_action: float = 0.0) -> Env:
-    """A world that counts steps, earns `reward` and pays 0.25 a step, ends by chance.
+    """An environment that counts steps, earns `reward` and pays 0.25 a step, ends by chance.
 
     It earns `per_action` times the action too.
     """
@@ -80,7 +80,7 @@ def test_every_environment_plays_one_episode_and_no_more(played: Episodes):
 
 def test_positions_go_from_start_to_the_longest_shown_end(played: Episodes):
     steps = np.arange(played.lengths[:3].max() + 1)[:, None]
-    # The world's one position is its step count, and it stands still after its end.
+    # The environment's one position is its step count, and it stands still after its end.
     np.testing.assert_array_equal(played.qpos[..., 0], np.minimum(steps, played.lengths[:3]))
 
 
@@ -104,7 +104,7 @@ def test_a_seed_decides_what_random_actions_do(algo: AlgoConfig):
     assert not np.isclose(first, episodes_of(algo, env).returns).any()
 
 
-def test_a_world_with_a_bad_number_ends_without_reward(algo: AlgoConfig):
+def test_an_environment_with_a_bad_number_ends_without_reward(algo: AlgoConfig):
     played = episodes_of(algo, counting_env(reward=float("nan")))
     assert played.diverged.all()
     assert played.terminated.all()

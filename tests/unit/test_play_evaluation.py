@@ -14,7 +14,8 @@ from supervision import save_meta
 from gmijax.cli.command import command
 from gmijax.config import EnvConfig, PlayConfig
 from gmijax.config.schema import to_dict
-from gmijax.deploy import pictures, playing
+from gmijax.deploy import pictures, playing, trained_run
+from gmijax.deploy.trained_run import checkpoint_of, open_run
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.learning.walking import walking_env
 from gmijax.machine.nvidia import Gpu
@@ -62,7 +63,7 @@ def test_the_latest_checkpoint_is_played_unless_one_is_named(
         ((f"run.dir={run.root}", "checkpoint=best"), best),
         (("checkpoint=best",), best),
     ):
-        assert playing.checkpoint_of(config_of(*overrides)) == expected
+        assert checkpoint_of(config_of(*overrides)) == expected
 
 
 @pytest.mark.parametrize(
@@ -73,15 +74,13 @@ def test_a_best_checkpoint_that_nothing_was_compared_by_is_told(
     compared: dict[str, Any], is_told: bool, run: RunPaths, monkeypatch: pytest.MonkeyPatch
 ):
     env = EnvConfig(name="ant", episode_length=None)
-    monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
-    monkeypatch.setattr(playing, "left_out", lambda checkpoint: None)
+    monkeypatch.setattr(trained_run, "trained_config", lambda checkpoint: (env, None))
+    monkeypatch.setattr(trained_run, "left_out", lambda checkpoint: None)
     first = run.checkpoint(100)
     meta = dataclasses.replace(CheckpointMeta.read(first), mean_return=-6.3, **compared)
     write_json(first / META, meta.to_dict())
     for wanted in ("best", str(first)):
-        config, _, changed = playing.open_run(
-            config_of(f"run.dir={run.root}", f"checkpoint={wanted}")
-        )
+        config, _, changed = open_run(config_of(f"run.dir={run.root}", f"checkpoint={wanted}"))
         assert config.checkpoint == str(first.resolve())
         assert (changed is not None) == (is_told and wanted == "best")
 
@@ -117,13 +116,13 @@ def test_a_checkpoint_that_cannot_be_meant_is_bad_input(
     other = shutil.copytree(run.root, tmp_path / "runs" / "y")
     config = config_of(*(text.format(run=run.root, other=other) for text in overrides))
     with pytest.raises(ConfigError, match=message):
-        playing.checkpoint_of(config)
+        checkpoint_of(config)
 
 
-def test_worlds_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytest.MonkeyPatch):
+def test_envs_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytest.MonkeyPatch):
     env = EnvConfig(name="ant", episode_length=None)
-    monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
-    monkeypatch.setattr(playing, "left_out", lambda checkpoint: None)
+    monkeypatch.setattr(trained_run, "trained_config", lambda checkpoint: (env, None))
+    monkeypatch.setattr(trained_run, "left_out", lambda checkpoint: None)
     config = config_of(f"run.dir={run.root}", "randomize=on")
     with pytest.raises(ConfigError, match="names nothing to draw"):
         playing.play(config)
@@ -133,8 +132,8 @@ def test_a_walking_test_is_refused_where_there_is_none(
     run: RunPaths, monkeypatch: pytest.MonkeyPatch
 ):
     env = EnvConfig(name="ant", episode_length=None)
-    monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
-    monkeypatch.setattr(playing, "left_out", lambda checkpoint: None)
+    monkeypatch.setattr(trained_run, "trained_config", lambda checkpoint: (env, None))
+    monkeypatch.setattr(trained_run, "left_out", lambda checkpoint: None)
     config = config_of(f"run.dir={run.root}", "walking_envs=8")
     with pytest.raises(ConfigError, match="walking_envs=8: ant has no walking test"):
         playing.play(config)
@@ -144,9 +143,10 @@ def test_a_robot_that_repeats_actions_has_no_walking_test(
     run: RunPaths, monkeypatch: pytest.MonkeyPatch
 ):
     env = EnvConfig(suite="playground", name="go1", episode_length=None, action_repeat=2)
+    monkeypatch.setattr(trained_run, "trained_config", lambda checkpoint: (env, None))
+    monkeypatch.setattr(trained_run, "left_out", lambda checkpoint: None)
+    monkeypatch.setattr(trained_run, "require_env", lambda env: None)
     monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
-    monkeypatch.setattr(playing, "left_out", lambda checkpoint: None)
-    monkeypatch.setattr(playing, "require_env", lambda env: None)
     said = "env.action_repeat=2; the walking test takes 1 only"
     with pytest.raises(ConfigError, match=f"^walking_envs=8: {said}$"):
         playing.play(config_of(f"run.dir={run.root}", "walking_envs=8"))
@@ -159,9 +159,9 @@ def test_a_robot_without_randomisation_cannot_be_played_with_one(
     run: RunPaths, monkeypatch: pytest.MonkeyPatch
 ):
     env = EnvConfig(suite="playground", name="spot", episode_length=None)
-    monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
-    monkeypatch.setattr(playing, "left_out", lambda checkpoint: None)
-    monkeypatch.setattr(playing, "require_env", lambda env: None)
+    monkeypatch.setattr(trained_run, "trained_config", lambda checkpoint: (env, None))
+    monkeypatch.setattr(trained_run, "left_out", lambda checkpoint: None)
+    monkeypatch.setattr(trained_run, "require_env", lambda env: None)
     with pytest.raises(ConfigError, match="Playground has no randomisation for spot"):
         playing.play(config_of(f"run.dir={run.root}", "randomize=on"))
 

@@ -47,13 +47,13 @@ def test_tiles_are_laid_row_by_row_and_gaps_are_black():
 
 
 class PaintedStage:
-    """Stands in for OpenGL: a picture is one pixel, as bright as the world's first position."""
+    """Stands in for OpenGL: a picture is one pixel, as bright as the first position."""
 
     def picture(self, qpos: np.ndarray) -> np.ndarray:
         return np.full((1, 1, 3), qpos[0], np.uint8)
 
 
-def test_worlds_whose_episode_is_over_stand_still_and_dim():
+def test_environments_whose_episode_is_over_stand_still_and_dim():
     qpos = np.array([[[100.0], [200.0]]] * 5, np.float32)
     trajectory = Trajectory(qpos, np.array([4, 1]), 0.1)
     pictures = list(play_film.frames(trajectory, PaintedStage(), (2, 1), 1))
@@ -100,7 +100,7 @@ def test_captions_lie_in_the_corner_and_below():
     below = captions.below(tile, 1.5)
     assert below.shape == (280, 320, 3)
     assert (captions.below(tile, 2.5) != below).any()
-    assert captions.label(1, tile) is tile  # A world of which nothing is known.
+    assert captions.label(1, tile) is tile  # An environment of which nothing is known.
     small = tile[:60, :80]
     assert captions.label(0, small) is small
     assert captions.below(small, 0.0) is small

@@ -32,7 +32,7 @@ def model_of(asset: str) -> mujoco.MjModel:
 
 
 def rising(model: mujoco.MjModel) -> Trajectory:
-    """Two worlds of which the second ends early; a free joint moves up by a metre a step."""
+    """Two environments of which the second ends early; a free joint moves up by a metre a step."""
     qpos = np.tile(model.qpos0, (NUM_STEPS + 1, 2, 1)).astype(np.float32)
     # What is where it was is not sent again.
     qpos[:, :, 2] += 1 + np.arange(NUM_STEPS + 1)[:, None]
@@ -70,7 +70,7 @@ class Recording:
         return [(at_s, flat.reshape(-1, 3)) for at_s, flat in found]
 
 
-def test_bodies_move_in_real_time_and_a_world_whose_episode_is_over_stays() -> None:
+def test_bodies_move_in_real_time_and_an_environment_whose_episode_is_over_stays() -> None:
     model = model_of("ant")
     recording = Recording(page(model, rising(model)))
     torso = model.body("torso").id

@@ -13,13 +13,9 @@ from supervision import gpu, machine, save
 
 from gmijax.cli.compose import compose
 from gmijax.control import restarts
-from gmijax.control.restarts import (
-    Attempts,
-    clear_unfinished,
-    keep_logs,
-    why_not_again,
-    with_gpus_left,
-)
+from gmijax.control.reduced_plan import with_gpus_left
+from gmijax.control.restarts import Attempts, why_not_again
+from gmijax.control.run_folder import clear_unfinished, keep_logs
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, ReportedError
 from gmijax.partition import reduction
 from gmijax.runs.folder import META, RunPaths, read_json, write_json

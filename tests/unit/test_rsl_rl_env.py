@@ -41,7 +41,7 @@ def test_first_episodes_can_be_cut(envs: Any):
     for _ in range(LENGTH):
         _, _, done, _ = envs.step(torch.zeros(NUM_ENVS, 1))
         ended.append(done.tolist())
-    assert [[row[world] for row in ended].index(True) + 1 for world in range(4)] == [5, 4, 2, 1]
+    assert [[row[index] for row in ended].index(True) + 1 for index in range(4)] == [5, 4, 2, 1]
 
 
 def test_what_only_the_critic_sees_is_a_group_of_its_own():

@@ -22,11 +22,12 @@ import gmijax
 from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.collectives.program import LocalCollectives
 from gmijax.errors import ConfigError
-from gmijax.learning.checkpoint import checkpoint_meta, on_host, require_disk_for
+from gmijax.learning.checkpoint import checkpoint_meta, require_disk_for
 from gmijax.learning.checkpoint_saver import CheckpointPart, CheckpointSaver
 from gmijax.learning.episode_window import Standing
 from gmijax.learning.member import Member, Members
 from gmijax.learning.normalize import moments_of, no_samples
+from gmijax.learning.saved_arrays import on_host
 from gmijax.learning.start import begin_episodes
 from gmijax.machine.xla_on_cpu import POOL
 from gmijax.runs.folder import RunPaths

@@ -43,13 +43,13 @@ def test_the_end_of_an_episode_is_told_as_a_monitor_does(envs: Any):
     obs, reward, done, infos = envs.step(STILL)
     total += reward
     assert done.all()
-    for world, info in enumerate(infos):
+    for index, info in enumerate(infos):
         assert info["TimeLimit.truncated"] is True
-        np.testing.assert_array_equal(info["terminal_observation"], start[world])
-        assert info["episode"]["r"] == pytest.approx(total[world], rel=1e-5)
+        np.testing.assert_array_equal(info["terminal_observation"], start[index])
+        assert info["episode"]["r"] == pytest.approx(total[index], rel=1e-5)
         assert info["episode"]["l"] == LENGTH
         # As its algorithms bootstrap: into our array.
-        reward[world] += 0.99 * 1.0
+        reward[index] += 0.99 * 1.0
     assert (obs != start).any(axis=1).all()
 
 
@@ -61,7 +61,7 @@ def test_a_seed_counts_for_the_next_reset_alone(envs: Any):
     assert (first != second).any()
 
 
-def test_a_world_that_falls_over_is_not_cut_by_time(bridge: Any):
+def test_an_environment_that_falls_over_is_not_cut_by_time(bridge: Any):
     envs = bridge.make(walker(9), 2)
     envs.reset()
     for _ in range(2):
@@ -75,7 +75,7 @@ def test_a_world_that_falls_over_is_not_cut_by_time(bridge: Any):
     assert not infos[0]["is_diverged"]
 
 
-def test_worlds_are_no_objects(bridge: Any, envs: Any):
+def test_environments_are_no_objects(bridge: Any, envs: Any):
     assert envs.get_attr("episode_length") == [LENGTH] * NUM_ENVS
     assert envs.get_attr("episode_length", [0, 2]) == [LENGTH] * 2
     assert envs.env_is_wrapped(bridge.Monitor) == [True] * NUM_ENVS

@@ -120,7 +120,7 @@ def test_commands_are_in_the_policy_and_can_be_set():
     assert PlainEnv(TASK).command is None
 
 
-def test_a_push_moves_the_world_until_it_is_taken_back():
+def test_a_push_moves_the_environment_until_it_is_taken_back():
     still, pushed = PlainEnv(TASK, seed=3), PlainEnv(TASK, seed=3)
     ball = pushed.model.body("ball").id
     pushed.data.xfrc_applied[ball, 1] = 5.0
@@ -131,7 +131,7 @@ def test_a_push_moves_the_world_until_it_is_taken_back():
     assert not pushed.data.xfrc_applied.any()
 
 
-def test_a_world_that_diverges_ends_with_reward_0():
+def test_an_environment_that_diverges_ends_with_reward_0():
     env = PlainEnv(TASK)
     env.data.xfrc_applied[:] = 1e12
     for _ in range(5):

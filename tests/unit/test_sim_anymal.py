@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from gmijax.sim import physics
+from gmijax.sim import physics, simulators
 from gmijax.sim.adapters.checks import check_env
 from gmijax.sim.registry import make_env
 from gmijax.sim.tasks import anymal
@@ -15,7 +15,7 @@ HIGH_KNEES = jnp.full((4, 3), 0.3)
 
 @pytest.fixture(scope="module")
 def model():
-    return physics.load("anymal", impl="jax", substeps=anymal.SUBSTEPS).mj_model
+    return simulators.load("anymal", impl="jax", substeps=anymal.SUBSTEPS).mj_model
 
 
 def state(
@@ -127,7 +127,7 @@ def test_servos_hold_the_standing_pose(model):
     assert not anymal.has_fallen(standing, knees)
 
 
-def glide(world, model, state, ctrl, read):
+def glide(sim, model, state, ctrl, read):
     """In place of physics: the base gets faster by what the first joint is told."""
     faster = state._replace(qvel=state.qvel.at[0].add(ctrl[0]))
     return faster, (jnp.zeros(anymal.ACTION_SIZE), HIGH_KNEES)

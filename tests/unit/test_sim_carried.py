@@ -1,4 +1,4 @@
-"""What worlds carry between control steps beside positions, velocities and the warm start."""
+"""What environments carry between steps beside positions, velocities and the warm start."""
 
 from __future__ import annotations
 
@@ -59,19 +59,19 @@ def driven(step: int, hand: np.ndarray) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("impl", ["jax", "warp"])
-def test_what_is_carried_moves_a_world_as_mujoco_in_c(impl: str):
+def test_what_is_carried_moves_an_environment_as_mujoco_in_c(impl: str):
     if impl == "warp":
         pytest.importorskip("warp")
     mj_model = mujoco.MjModel.from_xml_string(ALL_OF_IT)
-    world = from_mj_model(mj_model, impl=impl, substeps=SUBSTEPS, max_envs=2)
+    sim = from_mj_model(mj_model, impl=impl, substeps=SUBSTEPS, max_envs=2)
     data, rng = mujoco.MjData(mj_model), np.random.default_rng(0)
     hand = data.mocap_pos.copy()
     qpos, qvel = (jnp.tile(jnp.asarray(x, jnp.float32), (2, 1)) for x in (data.qpos, data.qvel))
     first = {name: jnp.asarray(value) for name, value in driven(0, hand).items()}
-    state = jax.vmap(lambda q, v: world.start(q, v, **first))(qpos, qvel)
+    state = jax.vmap(lambda q, v: sim.start(q, v, **first))(qpos, qvel)
     assert state.act is not None
     assert state.act.shape == (2, 3)
-    step = jax.jit(jax.vmap(world.step, in_axes=(None, 0, 0)))
+    step = jax.jit(jax.vmap(sim.step, in_axes=(None, 0, 0)))
     for count in range(STEPS):
         ctrl = rng.uniform(0, 1, mj_model.nu)
         now = driven(count, hand)
@@ -86,7 +86,7 @@ def test_what_is_carried_moves_a_world_as_mujoco_in_c(impl: str):
             for name, value in now.items()
         }
         state, sensed = step(
-            world.model,
+            sim.model,
             state._replace(**set_now),
             jnp.tile(jnp.asarray(ctrl, jnp.float32), (2, 1)),
         )
@@ -107,68 +107,68 @@ ARM = """<mujoco><worldbody><body><joint name="a" axis="0 1 0" range="-9 9"/><ge
 </body><body mocap="true"/></worldbody><actuator>{}</actuator></mujoco>"""
 
 
-def world_with(actuator: str) -> Physics:
+def sim_with(actuator: str) -> Physics:
     return from_mj_model(
         mujoco.MjModel.from_xml_string(ARM.format(actuator)), impl="jax", substeps=1
     )
 
 
 def test_a_model_without_memory_carries_nothing_more():
-    world = world_with('<motor joint="a"/>')
-    start = world.start(jnp.zeros(1), jnp.zeros(1))
+    sim = sim_with('<motor joint="a"/>')
+    start = sim.start(jnp.zeros(1), jnp.zeros(1))
     assert start == PhysicsState(start.qpos, start.qvel, start.qacc_warmstart)
     assert len(jax.tree.leaves(start)) == 3
-    moved, _ = jax.eval_shape(world.step, world.model, start, jnp.zeros(1))
+    moved, _ = jax.eval_shape(sim.step, sim.model, start, jnp.zeros(1))
     assert jax.tree.structure(moved) == jax.tree.structure(start)
 
 
 def test_a_start_knows_names_and_shapes_of_what_is_carried():
-    world, at = world_with('<motor joint="a"/>'), (jnp.zeros(1), jnp.zeros(1))
+    sim, at = sim_with('<motor joint="a"/>'), (jnp.zeros(1), jnp.zeros(1))
     with pytest.raises(
         ConfigError, match=r"no mocap can be carried; allowed are act, time, history"
     ):
-        world.start(*at, mocap=jnp.zeros(3))
+        sim.start(*at, mocap=jnp.zeros(3))
     with pytest.raises(ConfigError, match=r"mocap_pos has shape \(3,\), not \(1, 3\)"):
-        world.start(*at, mocap_pos=jnp.zeros(3))
+        sim.start(*at, mocap_pos=jnp.zeros(3))
     with pytest.raises(ConfigError, match=r"eq_active has shape \(1,\), not \(0,\)"):
-        world.start(*at, eq_active=jnp.ones(1))
+        sim.start(*at, eq_active=jnp.ones(1))
 
 
 def test_a_state_without_the_activations_of_its_model_is_refused():
-    world = world_with('<general joint="a" dyntype="filter" dynprm="0.1"/>')
+    sim = sim_with('<general joint="a" dyntype="filter" dynprm="0.1"/>')
     forgetful = PhysicsState(*jnp.zeros((3, 1)))
-    with pytest.raises(ConfigError, match="the state has no act, which world"):
-        jax.eval_shape(world.step, world.model, forgetful, jnp.zeros(1))
+    with pytest.raises(ConfigError, match="the state has no act, which sim"):
+        jax.eval_shape(sim.step, sim.model, forgetful, jnp.zeros(1))
 
 
 @pytest.mark.parametrize("given", [("mocap_pos",), ("mocap_quat",), ("mocap_pos", "mocap_quat")])
 def test_a_picture_shows_where_mocap_bodies_have_moved(given: tuple[str, ...]):
     text = ARM.format("").replace("<body mocap", '<body pos="0 1 0" mocap')
-    world = from_mj_model(mujoco.MjModel.from_xml_string(text), impl="jax", substeps=1)
+    sim = from_mj_model(mujoco.MjModel.from_xml_string(text), impl="jax", substeps=1)
     at = jnp.full(1, 0.5), jnp.zeros(1)
-    assert world.shown(world.start(*at)).tolist() == [0.5]
+    assert sim.shown(sim.start(*at)).tolist() == [0.5]
     moved = {"mocap_pos": [[1.0, 2.0, 3.0]], "mocap_quat": [[0.0, 1.0, 0.0, 0.0]]}
-    start = world.start(*at, **{name: jnp.array(moved[name]) for name in given})
-    data = mujoco.MjData(world.mj_model)
+    start = sim.start(*at, **{name: jnp.array(moved[name]) for name in given})
+    data = mujoco.MjData(sim.mj_model)
     still = {"mocap_pos": [[0.0, 1.0, 0.0]], "mocap_quat": [[1.0, 0.0, 0.0, 0.0]]}
-    put(data, np.asarray(world.shown(start)))
+    put(data, np.asarray(sim.shown(start)))
     assert data.qpos.tolist() == [0.5]
     for name in moved:
         assert getattr(data, name).tolist() == (moved if name in given else still)[name]
 
 
 def test_an_automatic_reset_begins_with_what_a_start_carries():
-    world = world_with('<general joint="a" dyntype="filter" dynprm="0.1"/>')
+    sim = sim_with('<general joint="a" dyntype="filter" dynprm="0.1"/>')
     spec, goal = EnvSpec("reach", 1, 1, 0.01, 10, ()), jnp.array([[0.0, 0.0, 1.0]])
 
     def reset(model, key):
-        start = world.start(jnp.zeros(1), jnp.zeros(1), mocap_pos=goal, act=jnp.full(1, 0.25))
+        start = sim.start(jnp.zeros(1), jnp.zeros(1), mocap_pos=goal, act=jnp.full(1, 0.25))
         return episode.begin(spec, start, (), start.qpos, key)
 
-    env = vectorise(world.env(spec, reset, lambda model, state, action: state))
-    state = env.reset(world.model, jax.random.split(jax.random.key(0), 2))
+    env = vectorise(sim.env(spec, reset, lambda model, state, action: state))
+    state = env.reset(sim.model, jax.random.split(jax.random.key(0), 2))
     moved = state.physics._replace(act=jnp.ones((2, 1)), mocap_pos=jnp.ones((2, 1, 3)))
     ended = state._replace(physics=moved, terminated=jnp.array([True, False]))
-    after = auto_reset(env, world.model, ended).physics
+    after = auto_reset(env, sim.model, ended).physics
     assert after.act.tolist() == [[0.25], [1.0]]
     assert after.mocap_pos.tolist() == [goal.tolist(), [[1.0, 1.0, 1.0]]]

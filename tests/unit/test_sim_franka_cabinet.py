@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from gmijax.errors import ConfigError
-from gmijax.sim import physics
+from gmijax.sim import physics, simulators
 from gmijax.sim.tasks import franka_cabinet as task
 from gmijax.sim.tasks.settings import FrankaCabinetSettings
 
@@ -20,8 +20,8 @@ HAND_AT_HANDLE = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 @pytest.fixture(scope="module")
-def world() -> physics.Physics:
-    return physics.load("franka_cabinet", impl="jax", substeps=task.SUBSTEPS)
+def sim() -> physics.Physics:
+    return simulators.load("franka_cabinet", impl="jax", substeps=task.SUBSTEPS)
 
 
 def pose(
@@ -104,8 +104,8 @@ def test_a_finger_behind_the_handle_is_told_from_one_at_it():
             assert bool(task.is_behind(at_handle._replace(fingers=moved))) is behind
 
 
-def test_pose_is_that_of_the_model_in_c(world: physics.Physics):
-    model = world.mj_model
+def test_pose_is_that_of_the_model_in_c(sim: physics.Physics):
+    model = sim.mj_model
     ids, data, rng = task.look_up(model), mujoco.MjData(model), np.random.default_rng(0)
     limits = model.jnt_range
     for _ in range(3):
@@ -125,8 +125,8 @@ def test_pose_is_that_of_the_model_in_c(world: physics.Physics):
         np.testing.assert_allclose(derived.handle, handle, atol=1e-5)
 
 
-def test_observation_scales_joints_and_is_clipped(world: physics.Physics):
-    ids = task.look_up(world.mj_model)
+def test_observation_scales_joints_and_is_clipped(sim: physics.Physics):
+    ids = task.look_up(sim.mj_model)
     qpos = np.append(ids.joints.upper, 0.25).astype(np.float32)
     qvel = np.array([100.0, -100.0, 2.0, *[0.0] * 6, 0.5], np.float32)
     state = physics.PhysicsState(jnp.array(qpos), jnp.array(qvel), jnp.zeros(10))
@@ -136,8 +136,8 @@ def test_observation_scales_joints_and_is_clipped(world: physics.Physics):
     np.testing.assert_allclose(obs[18:], [0.3, -0.1, 0.3, 0.25, 0.5], atol=1e-6)
 
 
-def test_start_is_noisy_within_the_limits_and_the_drawer_is_closed(world: physics.Physics):
-    model = world.mj_model
+def test_start_is_noisy_within_the_limits_and_the_drawer_is_closed(sim: physics.Physics):
+    model = sim.mj_model
     ids = task.look_up(model)
     qpos = jax.vmap(lambda key: task.draw_start(ids, model, key, SETTINGS))(
         jax.random.split(jax.random.key(0), 64)
@@ -183,16 +183,16 @@ def wanted_positions(model: mujoco.MjModel) -> npt.NDArray[np.float64]:
     return np.array(wanted)
 
 
-def test_the_drawer_can_be_opened_by_the_handle(world: physics.Physics):
+def test_the_drawer_can_be_opened_by_the_handle(sim: physics.Physics):
     # In C, by actions within [-1, 1]: each moves the targets by at most one step's worth.
-    model, limits = world.mj_model, world.mj_model.jnt_range[:9]
+    model, limits = sim.mj_model, sim.mj_model.jnt_range[:9]
     data, ids = mujoco.MjData(model), task.look_up(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("start").id)
-    targets, step = data.ctrl.copy(), task.action_speeds(SETTINGS) * world.control_dt_s
+    targets, step = data.ctrl.copy(), task.action_speeds(SETTINGS) * sim.control_dt_s
     for wanted in wanted_positions(model):
         targets += step * np.clip((wanted - targets) / step, -1.0, 1.0)
         data.ctrl = np.clip(targets, limits[:, 0], limits[:, 1])
-        mujoco.mj_step(model, data, world.substeps)
+        mujoco.mj_step(model, data, sim.substeps)
         seen = task.pose_of(ids, jnp.array(data.xpos), jnp.array(data.xquat))
         assert not task.is_behind(seen)
         if data.joint("drawer").qpos[0] > SETTINGS.open_m:

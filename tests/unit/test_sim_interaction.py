@@ -17,7 +17,7 @@ from gmijax.errors import ConfigError
 from gmijax.sim.adapters.checks import check_env
 from gmijax.sim.interaction import action_repeat, observation_history
 from gmijax.sim.interface import EnvState
-from gmijax.sim.randomize import make_worlds
+from gmijax.sim.randomize import make_envs
 from gmijax.sim.wrappers import env_keys, training_env
 
 
@@ -103,7 +103,7 @@ def test_what_only_the_value_function_sees_has_no_past():
 def test_the_configuration_puts_both_around_a_task(tmp_path: Path):
     (tmp_path / "point.py").write_text(POINT_TASK)
     told = (f"env={tmp_path}/point.py:make", "env.history=3", "env.action_repeat=2")
-    env = make_worlds(compose(*told).env, "jax", seed=0, first_env=0, num_envs=2)
+    env = make_envs(compose(*told).env, "jax", seed=0, first_env=0, num_envs=2)
     assert env.spec.obs_size == 6
     assert env.spec.control_dt_s == pytest.approx(0.2)
     assert env.spec.episode_length == 10
@@ -115,7 +115,7 @@ def test_what_a_task_carries_on_survives_resets_and_bad_numbers():
     check_env(env, "walker")
     batch = training_env(env)
     state, step = batch.init(None, env_keys(jax.random.key(0), 0, 3)), jax.jit(batch.step)
-    # The third world breaks in its second episode: it keeps the level of its first one.
+    # The third environment breaks in its second episode: it keeps the level of its first one.
     for broken in (0.0, 0.0, 2.0, 0.0, 0.0):
         before = state
         state, out = step(None, state, jnp.array([[0.0], [0.0], [broken]]))

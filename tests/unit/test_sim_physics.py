@@ -76,22 +76,22 @@ def test_the_small_state_forgets_nothing_and_substeps_are_steps_in_a_row():
     # The same compiled step, once fed with the whole data of the step before and once with data
     # rebuilt from the carried state: equal to the last bit, through contact and joint limit.
     model = mujoco.MjModel.from_xml_string(PENDULUM_OVER_FLOOR)
-    world = from_mj_model(model, impl="jax", substeps=3)
-    step = jax.jit(lambda data: mjx.step(world.model, data))
-    at_once = jax.jit(world.step)
-    assert world.control_dt_s == pytest.approx(0.03)
-    blank = mjx.make_data(world.model)
+    sim = from_mj_model(model, impl="jax", substeps=3)
+    step = jax.jit(lambda data: mjx.step(sim.model, data))
+    at_once = jax.jit(sim.step)
+    assert sim.control_dt_s == pytest.approx(0.03)
+    blank = mjx.make_data(sim.model)
     whole = small = blank
     for ctrl in np.random.default_rng(0).uniform(-1, 1, (30, 1)).astype(np.float32):
         start = PhysicsState(whole.qpos, whole.qvel, whole.qacc_warmstart)
-        for _ in range(world.substeps):
+        for _ in range(sim.substeps):
             whole = step(whole.replace(ctrl=jnp.array(ctrl)))
             carried = PhysicsState(small.qpos, small.qvel, small.qacc_warmstart)
             kept = {name: value for name, value in carried._asdict().items() if value is not None}
             small = step(blank.replace(ctrl=jnp.array(ctrl), **kept))
             for name in ("qpos", "qvel", "qacc_warmstart", "sensordata"):
                 np.testing.assert_array_equal(getattr(whole, name), getattr(small, name))
-        moved, sensors = at_once(world.model, start, jnp.array(ctrl))
+        moved, sensors = at_once(sim.model, start, jnp.array(ctrl))
         np.testing.assert_allclose(moved.qpos, whole.qpos, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(sensors, whole.sensordata, rtol=1e-3, atol=1e-3)
 
@@ -114,7 +114,7 @@ ARM_AND_FREE_BOX = """
 """
 
 
-def test_a_map_over_worlds_goes_through_the_physics_steps_once():
+def test_a_map_over_environments_goes_through_the_physics_steps_once():
     passes = []
 
     @jax.custom_batching.custom_vmap
@@ -128,10 +128,10 @@ def test_a_map_over_worlds_goes_through_the_physics_steps_once():
         return qpos, is_batched[0]
 
     mj_model = mujoco.MjModel.from_xml_string(PENDULUM_OVER_FLOOR)
-    world = from_mj_model(mj_model, impl="jax", substeps=2)
+    sim = from_mj_model(mj_model, impl="jax", substeps=2)
 
     def step(state: PhysicsState) -> jax.Array:
-        return world.step(world.model, state, jnp.zeros(1), lambda data: reading(data.qpos))[1]
+        return sim.step(sim.model, state, jnp.zeros(1), lambda data: reading(data.qpos))[1]
 
     jax.eval_shape(jax.vmap(step), PhysicsState(*jnp.zeros((3, 3, 1))))
     assert len(passes) == 1
@@ -142,8 +142,8 @@ def test_poses_are_those_of_mujoco_in_c(impl: str):
     if impl == "warp":
         pytest.importorskip("warp")
     mj_model = mujoco.MjModel.from_xml_string(ARM_AND_FREE_BOX)
-    world = from_mj_model(mj_model, impl=impl, substeps=1, max_envs=1)
-    poses = jax.jit(world.poses)
+    sim = from_mj_model(mj_model, impl=impl, substeps=1, max_envs=1)
+    poses = jax.jit(sim.poses)
     data, rng = mujoco.MjData(mj_model), np.random.default_rng(0)
     for _ in range(5):
         # Quaternions of any length: C normalises them too.
@@ -193,19 +193,19 @@ def test_a_buffer_of_warp_that_is_too_small_is_noticed(
     sizes: WarpSizes | None, overflow: list[bool]
 ):
     pytest.importorskip("warp")
-    world = from_mj_model(
+    sim = from_mj_model(
         mujoco.MjModel.from_xml_string(DROPPED_BALLS),
         impl="warp",
         substeps=2,
         max_envs=3,
         warp_sizes=sizes,
     )
-    qpos = jnp.tile(jnp.array(world.mj_model.qpos0, jnp.float32), (3, 1))
-    start = jax.vmap(world.start)(qpos, jnp.zeros((3, world.mj_model.nv)))
+    qpos = jnp.tile(jnp.array(sim.mj_model.qpos0, jnp.float32), (3, 1))
+    start = jax.vmap(sim.start)(qpos, jnp.zeros((3, sim.mj_model.nv)))
     assert start.overflow is not None
     assert not start.overflow.any()
-    step = jax.jit(jax.vmap(world.step, in_axes=(None, 0, None)))
-    moved, _ = step(world.model, start, jnp.zeros(0))
+    step = jax.jit(jax.vmap(sim.step, in_axes=(None, 0, None)))
+    moved, _ = step(sim.model, start, jnp.zeros(0))
     assert moved.overflow is not None
     assert moved.overflow.tolist() == [overflow] * 3
 
@@ -218,16 +218,16 @@ def test_bits_of_overflow_are_those_of_warp():
     assert physics.ALL_BITS == kinds.ALL
 
 
-def test_worlds_of_several_jobs_move_as_those_of_one():
+def test_environments_of_several_jobs_move_as_those_of_one():
     pytest.importorskip("warp")
     mj_model = mujoco.MjModel.from_xml_string(PENDULUM_OVER_FLOOR)
-    world = from_mj_model(mj_model, impl="warp", substeps=2)
+    sim = from_mj_model(mj_model, impl="warp", substeps=2)
     rng = np.random.default_rng(0)
     qpos, qvel, ctrl = (jnp.array(rng.uniform(-1, 1, (2, 3, 1)), jnp.float32) for _ in range(3))
-    start = jax.vmap(jax.vmap(world.start))(qpos, qvel)
-    step = jax.vmap(world.step, in_axes=(None, 0, 0))
-    together = jax.jit(jax.vmap(step, in_axes=(None, 0, 0)))(world.model, start, ctrl)
+    start = jax.vmap(jax.vmap(sim.start))(qpos, qvel)
+    step = jax.vmap(sim.step, in_axes=(None, 0, 0))
+    together = jax.jit(jax.vmap(step, in_axes=(None, 0, 0)))(sim.model, start, ctrl)
     for job in range(2):
-        alone = jax.jit(step)(world.model, jax.tree.map(lambda x, j=job: x[j], start), ctrl[job])
+        alone = jax.jit(step)(sim.model, jax.tree.map(lambda x, j=job: x[j], start), ctrl[job])
         for own, all_of_them in zip(*map(jax.tree.leaves, (alone, together)), strict=True):
             np.testing.assert_allclose(own, all_of_them[job], atol=1e-5)

@@ -1,4 +1,4 @@
-"""Domain randomisation: the draws, and that every world then moves as its own model says."""
+"""Domain randomisation: the draws, and that every environment then moves as its own model says."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
 from gmijax.sim import episode, physics, randomize, wrappers
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.randomize import make_worlds, randomized, randomized_by_episode
-from gmijax.sim.warp.worlds import MODEL_LEAVES
+from gmijax.sim.randomize import make_envs, randomized, randomized_by_episode
+from gmijax.sim.warp.batch import MODEL_LEAVES
 from gmijax.sim.wrappers import env_keys, training_env
 
 NUM_ENVS = 4
@@ -61,25 +61,23 @@ ALL_LEAVES = {leaf: LeafRange(operation="scale", range=(0.5, 1.5)) for leaf in R
 
 
 def sledge(impl: str = "jax") -> Env:
-    world = physics.from_mj_model(
+    sim = physics.from_mj_model(
         mujoco.MjModel.from_xml_string(SLEDGE), impl=impl, substeps=1, max_envs=NUM_ENVS
     )
-    spec = EnvSpec("sledge", 5, 2, world.control_dt_s, 100, ("nothing",))
+    spec = EnvSpec("sledge", 5, 2, sim.control_dt_s, 100, ("nothing",))
 
     def reset(model: Any, key: jax.Array) -> EnvState:
         del model
-        qpos = jnp.asarray(world.mj_model.qpos0, jnp.float32)
-        start = world.start(qpos, jnp.array(STARTS["qvel"]))
+        qpos = jnp.asarray(sim.mj_model.qpos0, jnp.float32)
+        start = sim.start(qpos, jnp.array(STARTS["qvel"]))
         return episode.begin(spec, start, (), start.qvel, key)
 
     def step(model: Any, state: EnvState, action: jax.Array) -> EnvState:
-        moved, _ = world.step(model, state.physics, action)
+        moved, _ = sim.step(model, state.physics, action)
         reward = jnp.zeros(()), {"nothing": jnp.zeros(())}
         return episode.advance(state, moved, (), moved.qvel, reward, jnp.zeros((), bool))
 
-    return Env(
-        spec, world.model, reset, step, world.mj_model, lambda s: s.physics.qpos, world.max_envs
-    )
+    return Env(spec, sim.model, reset, step, sim.mj_model, lambda s: s.physics.qpos, sim.max_envs)
 
 
 def drawn(env: Env, seed: int = 0, first_env: int = 0, num_envs: int = NUM_ENVS, **ranges: Any):
@@ -104,24 +102,24 @@ def test_mujoco_warp_is_told_of_all_that_is_drawn(env: Env):
     assert {leaf.removeprefix(".") for leaf in drawn(env)} <= set(MODEL_LEAVES)
 
 
-def test_only_what_is_drawn_and_the_constants_of_such_a_model_are_per_world(env: Env):
+def test_only_what_is_drawn_and_the_constants_of_such_a_model_are_per_environment(env: Env):
     assert set(drawn(env, dof_damping={"operation": "scale", "range": (0.5, 2.0)})) == {
         ".dof_damping"
     }
     with_mass = drawn(env, body_mass={"operation": "scale", "range": (0.5, 2.0)})
     assert set(with_mass) == {".body_mass", ".body_inertia", *DERIVED}
-    for world in range(NUM_ENVS):
-        mj_model = model_of_world(env, with_mass, world)
+    for index in range(NUM_ENVS):
+        mj_model = model_of_env(env, with_mass, index)
         for name in DERIVED:
             expected = getattr(mj_model, name.removeprefix("."))
-            np.testing.assert_allclose(with_mass[name][world], expected, rtol=1e-5)
+            np.testing.assert_allclose(with_mass[name][index], expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
     ("operation", "low", "high"), [("scale", 0.5, 0.6), ("add", -0.3, 0.4), ("set", 3.0, 4.0)]
 )
 @pytest.mark.parametrize("draw", ["each", "shared"])
-def test_draws_are_in_range_and_differ_by_world(
+def test_draws_are_in_range_and_differ_by_environment(
     env: Env, operation: str, low: float, high: float, draw: str
 ):
     leaves = drawn(
@@ -177,34 +175,34 @@ def test_neither_the_split_over_gmis_nor_other_leaves_change_the_draws(env: Env)
     np.testing.assert_array_equal(alone, whole[".body_mass"])
 
 
-def model_of_world(env: Env, leaves: dict[str, np.ndarray], world: int) -> mujoco.MjModel:
-    """A model of MuJoCo in C with the numbers of one world, constants made anew from them."""
+def model_of_env(env: Env, leaves: dict[str, np.ndarray], index: int) -> mujoco.MjModel:
+    """A model of MuJoCo in C with the numbers of one environment and constants made of them."""
     mj_model = copy.copy(env.mj_model)
     for name, values in leaves.items():
         if name not in DERIVED:
-            getattr(mj_model, name.removeprefix("."))[:] = values[world]
+            getattr(mj_model, name.removeprefix("."))[:] = values[index]
     mujoco.mj_setConst(mj_model, mujoco.MjData(mj_model))
     return mj_model
 
 
 @pytest.mark.parametrize("impl", ["jax", pytest.param("warp", marks=pytest.mark.slow)])
-def test_every_world_moves_as_mujoco_in_c_says(impl: str):
+def test_every_environment_moves_as_mujoco_in_c_says(impl: str):
     if impl == "warp":
         pytest.importorskip("warp")
     many = randomized(sledge(impl), ALL_LEAVES, seed=1, first_env=0, num_envs=NUM_ENVS)
-    worlds = wrappers.vectorise(many)
-    state = worlds.reset(many.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
-    step = jax.jit(worlds.step)
+    batched = wrappers.vectorise(many)
+    state = batched.reset(many.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
+    step = jax.jit(batched.step)
     for _ in range(STEPS):
         state = step(many.model, state, jnp.tile(jnp.array(STARTS["ctrl"]), (NUM_ENVS, 1)))
     leaves = drawn(sledge(), seed=1)
     effects = dict.fromkeys(RANDOMIZED_LEAVES, 0.0)
-    for world in range(NUM_ENVS):
-        expected = motion_in_c(model_of_world(many, leaves, world))
-        np.testing.assert_allclose(state.physics.qvel[world], expected, atol=2e-4)
+    for index in range(NUM_ENVS):
+        expected = motion_in_c(model_of_env(many, leaves, index))
+        np.testing.assert_allclose(state.physics.qvel[index], expected, atol=2e-4)
         for leaf in effects:
             without = {name: v for name, v in leaves.items() if name != f".{leaf}"}
-            other = motion_in_c(model_of_world(many, without, world))
+            other = motion_in_c(model_of_env(many, without, index))
             effects[leaf] = max(effects[leaf], np.abs(other - expected).max())
     # Each leaf matters here, so none can have been forgotten.
     assert min(effects.values()) > 1e-3, effects
@@ -240,8 +238,8 @@ def test_every_episode_may_have_a_model_of_its_own(env: Env, monkeypatch: pytest
     assert set(np.concatenate(seen)) == set(range(8))
     config = compose("env=ball_balance", "env.randomize=episode").env
     monkeypatch.setattr(randomize, "POOL", 3)
-    worlds = make_worlds(config, "jax", seed=0, first_env=0, num_envs=2)
-    assert worlds.model.body_mass.shape[0] == 3
+    envs = make_envs(config, "jax", seed=0, first_env=0, num_envs=2)
+    assert envs.model.body_mass.shape[0] == 3
 
 
 @pytest.mark.parametrize(
@@ -292,7 +290,7 @@ def test_on_needs_something_to_draw_and_a_model_to_draw_it_in(env: Env):
 
 
 @pytest.mark.parametrize(("written", "is_on"), [("on", True), ("true", True), ("false", False)])
-def test_worlds_are_randomised_where_the_configuration_says_so(written: str, is_on: bool):
+def test_environments_are_randomised_where_the_configuration_says_so(written: str, is_on: bool):
     config = compose("env=ball_balance", f"env.randomize={written}").env
-    env = make_worlds(config, "jax", seed=0, first_env=0, num_envs=2)
+    env = make_envs(config, "jax", seed=0, first_env=0, num_envs=2)
     assert (env.model_axes is not None) == is_on

@@ -5,14 +5,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from gmijax.sim import physics
+from gmijax.sim import physics, simulators
 from gmijax.sim.tasks import humanoid, lookup, runner
 from gmijax.sim.tasks.settings import HumanoidSettings
 
 
 @pytest.fixture(scope="module")
 def model():
-    return physics.load("humanoid", impl="jax", substeps=humanoid.SUBSTEPS).mj_model
+    return simulators.load("humanoid", impl="jax", substeps=humanoid.SUBSTEPS).mj_model
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from gmijax.sim import physics, rotations
+from gmijax.sim import physics, rotations, simulators
 from gmijax.sim.interface import Env
 from gmijax.sim.rewards import total_reward
 from gmijax.sim.tasks import shadow_hand
@@ -18,14 +18,14 @@ CUBE = slice(24, 31)
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return physics.load("shadow_hand", impl="jax", substeps=shadow_hand.SUBSTEPS).mj_model
+    return simulators.load("shadow_hand", impl="jax", substeps=shadow_hand.SUBSTEPS).mj_model
 
 
 @pytest.fixture(scope="module")
 def frozen_env() -> Iterator[Env]:
-    """The task in a world where nothing moves: only what the task adds to physics is left."""
+    """The task where nothing moves: only what the task adds to physics is left."""
 
-    def stand_still(world, model, state, ctrl, read):
+    def stand_still(sim, model, state, ctrl, read):
         zeros = jnp.zeros((shadow_hand.NUM_TIPS, 13)), jnp.zeros((shadow_hand.NUM_TIPS, 6))
         return state, shadow_hand.Touch(jnp.zeros(24), *zeros)
 
@@ -97,7 +97,7 @@ def test_fingertips_are_where_mujoco_has_them(model, seed: int):
         np.testing.assert_allclose(rotation, site.xmat, atol=1e-5)
 
 
-def test_the_cubes_angular_velocity_is_seen_from_the_world(model):
+def test_the_cubes_angular_velocity_is_seen_from_the_environment(model):
     ids, data = shadow_hand.look_up(model), random_pose(model, 3)
     state = physics.PhysicsState(*(jnp.array(x) for x in (data.qpos, data.qvel, data.qvel)))
     expected, body = np.zeros(6), model.body("cube").id

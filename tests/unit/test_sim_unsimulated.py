@@ -74,8 +74,8 @@ def test_flags_that_change_no_step_are_taken(flag: str, value: str):
         '1 1"/><body pos="0 0 .1"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
     )
     asked = mujoco.MjModel.from_xml_string(text)
-    world = from_mj_model(asked, impl="jax", substeps=1)
-    taken = world.mj_model
+    sim = from_mj_model(asked, impl="jax", substeps=1)
+    taken = sim.mj_model
     for name, bits in WITHOUT_EFFECT:
         assert not getattr(taken.opt, name) & bits
     assert (asked.opt.enableflags, asked.opt.disableflags) != (0, 0)

@@ -22,12 +22,12 @@ def compiled(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
 
 
 @cache
-def worlds(episode_length: int) -> BatchedEnv:
+def envs(episode_length: int) -> BatchedEnv:
     return compiled(walker(episode_length))
 
 
 @cache
-def worlds_with_head_starts(episode_length: int) -> BatchedEnv:
+def envs_with_head_starts(episode_length: int) -> BatchedEnv:
     return compiled(walker(episode_length), random_ep_len=True)
 
 
@@ -61,7 +61,7 @@ def test_keys_of_environments_are_those_of_fold_in():
 
 
 def test_time_limit_truncates_and_a_new_episode_begins_elsewhere():
-    env = worlds(2)
+    env = envs(2)
     first = start(env, 2)
     after, going_on = step(env, first)
     assert int(going_on.finished.count) == 0
@@ -86,10 +86,10 @@ def test_time_limit_truncates_and_a_new_episode_begins_elsewhere():
 def test_two_halves_see_what_the_whole_sees():
     parts = []
     for first, count in ((0, 4), (0, 2), (2, 2)):
-        state, noise_keys = split_keys(start(worlds(2), count, first, seed=3))
+        state, noise_keys = split_keys(start(envs(2), count, first, seed=3))
         for _ in range(3):
-            state, out = step(worlds(2), state)
-        head_start = start(worlds_with_head_starts(1000), count, first, seed=3).head_start
+            state, out = step(envs(2), state)
+        head_start = start(envs_with_head_starts(1000), count, first, seed=3).head_start
         noise = jax.random.key_data(noise_keys)
         parts.append((out.next_obs, state.env.obs, noise, head_start))
     for whole, left, right in zip(*parts, strict=True):
@@ -97,7 +97,7 @@ def test_two_halves_see_what_the_whole_sees():
 
 
 def test_split_keys_never_hands_out_the_same_key_twice():
-    state, first = split_keys(start(worlds(2), 2))
+    state, first = split_keys(start(envs(2), 2))
     state, second = split_keys(state)
     drawn = np.concatenate([jax.random.key_data(keys) for keys in (first, second, state.env.key)])
     assert len(np.unique(drawn, axis=0)) == 6
@@ -111,7 +111,7 @@ def test_more_environments_than_the_model_was_made_for():
 
 def test_first_episodes_end_at_random_times_and_do_not_count():
     # It ends by itself after three steps: what is shorter was cut.
-    env = worlds_with_head_starts(3)
+    env = envs_with_head_starts(3)
     state = start(env, 64)
     head_start = state.head_start
     assert set(head_start.tolist()) == {0, 1, 2}
@@ -124,8 +124,8 @@ def test_first_episodes_end_at_random_times_and_do_not_count():
     assert state.env.steps.tolist() == head_start.tolist()
 
 
-def test_worlds_with_bad_numbers_end_without_reward_and_start_over():
-    env = worlds(100)
+def test_environments_with_bad_numbers_end_without_reward_and_start_over():
+    env = envs(100)
     state = start(env, 4)
     # A position of 1e7 is possible, an observation is not.
     position = jnp.array([0.0, jnp.nan, 1e12, 1e7])[:, None] - 1.0
@@ -142,7 +142,7 @@ def test_worlds_with_bad_numbers_end_without_reward_and_start_over():
     assert out.overflowed == {}  # There are no buffers that could be full.
 
 
-def test_worlds_that_met_a_full_buffer_are_counted_by_buffer():
+def test_environments_that_met_a_full_buffer_are_counted_by_buffer():
     def overflow(state: EnvState) -> jax.Array:
         return jnp.stack([jnp.ones((), bool), state.obs[0] > 1.5])
 

@@ -52,7 +52,7 @@ def run(tmp_path: Path) -> RunPaths:
         ("randomize=episode", "off or on"),
     ],
 )
-def test_a_resumed_run_keeps_what_its_worlds_remember(run: RunPaths, key: str, kept: str):
+def test_a_resumed_run_keeps_what_its_environments_remember(run: RunPaths, key: str, kept: str):
     save(run, 100)
     with pytest.raises(ConfigError, match=f"^env.{key}: a resumed run keeps its {kept}$"):
         find_start_point(config_of(run.root, f"env.{key}"))

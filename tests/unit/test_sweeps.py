@@ -138,13 +138,14 @@ def test_jobs_that_place_themselves_are_refused(override: str, said: str) -> Non
 def test_jobs_are_ranked_by_evaluations_if_they_make_some() -> None:
     asked = SweepConfig(objective="eval/return")
     with pytest.raises(ConfigError, match=r"^sweep\.objective=eval/return: needs eval\.every"):
-        with_objective(asked, jobs_of([compose()]))
-    some = jobs_of([compose("eval.every=100"), compose()])
-    assert with_objective(SweepConfig(), some).objective == "return"
-    [job] = some[:1]
-    assert with_objective(SweepConfig(objective="window/return"), [job]).objective == "return"
-    sweep = with_objective(SweepConfig(), [job])
-    assert sweep == with_objective(asked, [job]) == asked
+        with_objective(asked, [compose()])
+    evaluates = compose("eval.every=100")
+    assert with_objective(SweepConfig(), [evaluates, compose()]).objective == "return"
+    windowed = SweepConfig(objective="window/return")
+    assert with_objective(windowed, [evaluates]).objective == "return"
+    sweep = with_objective(SweepConfig(), [evaluates])
+    assert sweep == with_objective(asked, [evaluates]) == asked
+    [job] = jobs_of([evaluates])
     for steps, more in (
         (50, {}),
         (100, {"eval/return": 2.0}),
@@ -171,7 +172,7 @@ def test_returns_of_different_rewards_are_warned_of(
     objective: str, overrides: str, warns: bool
 ) -> None:
     jobs = build_sweep(("env=ant", "eval.every=100", f"sweep.objective={objective}", overrides))
-    said = why_not_comparable(jobs.jobs, jobs.settings)
+    said = why_not_comparable(jobs.configs, jobs.settings)
     assert (said is not None) == warns
     if said:
         assert said.startswith(f"warning: sweep.objective={objective}: jobs differ in env.rewards")
@@ -351,7 +352,7 @@ def test_a_job_is_ranked_by_its_last_full_window(key: str, direction: Any) -> No
         (-140.0, True, 175),
     ]
     assert progress.curve == [(400, -137.0), (500, -140.0)]
-    # Worlds that begin anew after a restart: what was measured before is better.
+    # Environments that begin anew after a restart: what was measured before is better.
     progress.take(lines_of((-9.0, 120, False), key=key)[0], sweep)
     assert (progress.value, progress.is_full) == (-140.0, True)
 

@@ -143,7 +143,7 @@ def test_a_step_is_compiled_once(arrays: Any, autoreset: Any):
     assert set(traced) == {"reset", "step"}
 
 
-def test_a_world_starts_over_in_the_step_that_ends_its_episode(envs: GmijaxVectorEnv):
+def test_an_environment_starts_over_in_the_step_that_ends_its_episode(envs: GmijaxVectorEnv):
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     before, _ = envs.reset(seed=0)
     rewards = np.zeros(NUM_ENVS)
@@ -209,7 +209,7 @@ def test_modes_agree_on_all_that_is_not_a_reset(
     same(next_step.step(STILL)[0], ends[0][0])
 
 
-def test_without_autoreset_a_world_waits_for_its_reset(disabled: GmijaxVectorEnv):
+def test_without_autoreset_an_environment_waits_for_its_reset(disabled: GmijaxVectorEnv):
     disabled.reset(seed=0)
     for _ in range(LENGTH):
         end, _, _, truncated, _ = disabled.step(STILL)
@@ -226,7 +226,7 @@ def test_without_autoreset_a_world_waits_for_its_reset(disabled: GmijaxVectorEnv
     np.testing.assert_array_equal(reward != 0, mask)
 
 
-def test_a_mask_resets_no_other_world(envs: GmijaxVectorEnv):
+def test_a_mask_resets_no_other_environment(envs: GmijaxVectorEnv):
     envs.reset(seed=0)
     before = envs.step(STILL)[0]
     mask = np.array([False, True, False, False])
@@ -250,7 +250,7 @@ def test_a_seed_decides_the_episodes_and_none_draws_others(envs: GmijaxVectorEnv
     assert len(np.unique(first, axis=0)) == NUM_ENVS
 
 
-def test_every_world_may_have_a_seed_of_its_own(envs: GmijaxVectorEnv):
+def test_every_environment_may_have_a_seed_of_its_own(envs: GmijaxVectorEnv):
     first = envs.reset(seed=[1, 2, 2, 2**70])[0]
     second = envs.reset(seed=np.array([2, 1, 3, 4]))[0]
     np.testing.assert_array_equal(first[[0, 1, 1]], [second[1], second[0], first[2]])
@@ -259,7 +259,7 @@ def test_every_world_may_have_a_seed_of_its_own(envs: GmijaxVectorEnv):
     assert ((drawn[0] == drawn[1]).all(axis=1) == [True, False, False, True]).all()
 
 
-def test_a_world_that_diverges_says_so():
+def test_an_environment_that_diverges_says_so():
     envs = GmijaxVectorEnv(walker(9), 2)
     envs.reset(seed=0)
     _, reward, terminated, _, info = envs.step(np.array([[np.nan], [0.0]]))
@@ -425,14 +425,14 @@ class PaintedStage:
         return self._image
 
 
-def test_skrl_asks_every_world(envs: GmijaxVectorEnv):
+def test_skrl_asks_every_environment(envs: GmijaxVectorEnv):
     assert envs.call("render") is None
     assert envs.call("episode_length") == (LENGTH,) * NUM_ENVS
     with pytest.raises(AttributeError, match="jump"):
         envs.call("jump")
 
 
-def test_every_world_has_its_picture(monkeypatch: pytest.MonkeyPatch):
+def test_every_environment_has_its_picture(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pictures, "Stage", PaintedStage)
     env = point_mass_env(LENGTH)._replace(mj_model="a model")
     envs = GmijaxVectorEnv(env, NUM_ENVS, autoreset="next_step", render_mode="rgb_array")

@@ -1,4 +1,4 @@
-"""Sizes of MuJoCo Warp's buffers, and the model that JAX has of its worlds, without Warp."""
+"""Sizes of MuJoCo Warp's buffers, and the model that JAX has of its environments, without Warp."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from mujoco import mjx
 from gmijax.sim.impl import WarpSizes
 from gmijax.sim.kinematic_model import kinematic_model
 from gmijax.sim.many_contacts import MANY, warn_of_many
+from gmijax.sim.warp.batch import MODEL_LEAVES
 from gmijax.sim.warp.sizes import bounds_of
-from gmijax.sim.warp.worlds import MODEL_LEAVES
 
 
 def geoms(*more: str, option: str = "", rest: str = "") -> mujoco.MjModel:
@@ -120,7 +120,7 @@ dim="2" radius=".01"/></body></worldbody><contact><pair geom1="floor" geom2="g"/
 <sensor><distance geom1="floor" geom2="g" cutoff="1"/></sensor></mujoco>"""
 
 
-def test_worlds_of_warp_have_a_model_in_jax_that_mjx_jax_could_not_simulate():
+def test_environments_of_warp_have_a_model_in_jax_that_mjx_jax_could_not_simulate():
     mj_model = mujoco.MjModel.from_xml_string(ONLY_FOR_WARP)
     model = kinematic_model(mj_model)
     for name in MODEL_LEAVES:

@@ -1,4 +1,4 @@
-"""How worlds of MuJoCo Warp are handed over, without Warp: layout, maps over worlds, readings."""
+"""How environments are handed to MuJoCo Warp, without Warp: layout, maps, readings."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from gmijax.sim.impl import WarpSizes
+from gmijax.sim.warp.batch import MODEL_LEAVES, OVERFLOW, STATE, lay_out
 from gmijax.sim.warp.step import WarpStep
-from gmijax.sim.warp.worlds import MODEL_LEAVES, OVERFLOW, STATE, lay_out
 
-JOBS, WORLDS = 2, 3
+JOBS, ENVS = 2, 3
 SHAPES = {**dict.fromkeys((*STATE, "ctrl"), (2,)), OVERFLOW: (), "sensordata": (4,)}
 
 
@@ -35,7 +35,7 @@ def test_arrays_of_the_buffer_are_apart_and_what_goes_in_and_comes_out_is_in_a_r
 
 
 class Arithmetic(WarpStep):
-    """Worlds whose step is a sum, and how many of them and of each leaf were stepped at once."""
+    """Steps that are sums, and how many environments and rows of leaves were stepped at once."""
 
     seen: list[tuple[int, dict[str, int]]]
 
@@ -63,29 +63,29 @@ def model_with(body_mass: jax.Array) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("mass_shape", "rows"), [((2,), 1), ((WORLDS, 2), JOBS * WORLDS), ((JOBS, 1, 2), 6)]
+    ("mass_shape", "rows"), [((2,), 1), ((ENVS, 2), JOBS * ENVS), ((JOBS, 1, 2), 6)]
 )
-def test_a_map_over_jobs_and_worlds_is_one_call_of_all_worlds(
+def test_a_map_over_jobs_and_environments_is_one_call_of_all_environments(
     step: Arithmetic, mass_shape: tuple[int, ...], rows: int
 ):
     rng = np.random.default_rng(0)
-    mass, ctrl = (jnp.array(rng.uniform(size=s), jnp.float32) for s in (mass_shape, (WORLDS, 2)))
-    state = {name: jnp.array(rng.uniform(size=(JOBS, WORLDS, 2)), jnp.float32) for name in STATE}
+    mass, ctrl = (jnp.array(rng.uniform(size=s), jnp.float32) for s in (mass_shape, (ENVS, 2)))
+    state = {name: jnp.array(rng.uniform(size=(JOBS, ENVS, 2)), jnp.float32) for name in STATE}
 
     def one(body_mass: jax.Array, state: Any, ctrl: jax.Array) -> Any:
         return step(model_with(body_mass), state, ctrl, lambda data: data.sensordata[:2])
 
-    of_worlds = 0 if mass_shape == (WORLDS, 2) else None
+    of_envs = 0 if mass_shape == (ENVS, 2) else None
     of_jobs = 0 if mass_shape == (JOBS, 1, 2) else None
     mass = mass.reshape(JOBS, 2) if of_jobs == 0 else mass
-    mapped = jax.vmap(jax.vmap(one, (of_worlds, 0, 0)), (of_jobs, 0, None))
+    mapped = jax.vmap(jax.vmap(one, (of_envs, 0, 0)), (of_jobs, 0, None))
     moved, reading = jax.jit(mapped)(mass, state, ctrl)
     factor = mass[:, None] if of_jobs == 0 else mass
     for name in STATE:
         np.testing.assert_allclose(moved[name], state[name] + ctrl * factor, rtol=1e-6)
     assert moved[OVERFLOW].tolist() == [[0, 1, 2], [3, 4, 5]]
     np.testing.assert_array_equal(reading, state["qpos"])
-    assert step.seen[-1] == (JOBS * WORLDS, {"body_mass": rows})
+    assert step.seen[-1] == (JOBS * ENVS, {"body_mass": rows})
 
 
 def test_a_task_may_read_the_controls(step: Arithmetic):
@@ -95,7 +95,7 @@ def test_a_task_may_read_the_controls(step: Arithmetic):
     assert read.tolist() == [2.0, 4.0]
 
 
-def test_what_the_data_do_not_have_for_each_world_is_named(step: Arithmetic):
+def test_what_the_data_do_not_have_for_each_environment_is_named(step: Arithmetic):
     state = {name: jnp.zeros(2) for name in STATE}
     with pytest.raises(AttributeError, match=r"^data\.contact: MuJoCo Warp has no such array"):
         step(model_with(jnp.ones(2)), state, jnp.zeros(2), lambda data: data.contact)

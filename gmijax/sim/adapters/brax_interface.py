@@ -35,10 +35,10 @@ WithModel = Callable[[PyTree], AbstractContextManager[None]]
 
 
 class Carried(NamedTuple):
-    """What a world takes from one episode to the next.
+    """What an environment takes from one episode to the next.
 
     Attributes:
-      first: their state at the world's first start, with an empty `info`.
+      first: their state at the environment's first start, with an empty `info`.
       info: of their state now: what Brax's and Playground's automatic resets leave alone, such as
         the random key that new commands are drawn from.
     """
@@ -70,7 +70,7 @@ def adapt(
     does. `done` terminates, unless `info["truncation"]` says that time ran out.
 
     Args:
-      theirs: their environment, one world, without wrappers.
+      theirs: one of their environments, without wrappers.
       name: for messages and logs.
       episode_length: steps after which an episode is truncated.
       mj_model: the MuJoCo model to film it with, None for no films.
@@ -85,16 +85,7 @@ def adapt(
         qpos is None or jax.eval_shape(qpos, start).shape != (mj_model.nq,)
     ):
         mj_model = qpos = None
-    spec = EnvSpec(
-        name=name,
-        obs_size=_obs_size(start.obs, name),
-        action_size=int(theirs.action_size),
-        control_dt_s=float(getattr(theirs, "dt", math.nan)),
-        episode_length=episode_length,
-        reward_terms=(REWARD,),
-        metrics=tuple(sorted(key for key, value in start.metrics.items() if value.shape == ())),
-        actor_obs_size=_actor_obs_size(start.obs),
-    )
+    spec = _spec_of(theirs, start, name, episode_length)
 
     def positions(state: EnvState) -> Array:
         return jnp.zeros(0) if qpos is None else qpos(state.physics)
@@ -105,6 +96,20 @@ def adapt(
     env = env._replace(next_episode=partial(_next_episode, spec))
     check_env(env, f"env.name={name}")
     return env
+
+
+def _spec_of(theirs: Any, start: Any, name: str, episode_length: int) -> EnvSpec:
+    """By the shapes of their first state."""
+    return EnvSpec(
+        name=name,
+        obs_size=_obs_size(start.obs, name),
+        action_size=int(theirs.action_size),
+        control_dt_s=float(getattr(theirs, "dt", math.nan)),
+        episode_length=episode_length,
+        reward_terms=(REWARD,),
+        metrics=tuple(sorted(key for key, value in start.metrics.items() if value.shape == ())),
+        actor_obs_size=_actor_obs_size(start.obs),
+    )
 
 
 def _reset(theirs: Any, own: WithModel, spec: EnvSpec, model: PyTree, key: PRNGKey) -> EnvState:

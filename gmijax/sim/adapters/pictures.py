@@ -1,4 +1,4 @@
-"""Pictures of the worlds of a vector environment, in the process of the user."""
+"""Pictures of the environments of a vector environment, in the process of the user."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SIZE = (640, 480)
 
 
 class Pictures:
-    """Draws worlds of `env`.
+    """Draws environments of `env`.
 
     Raises:
       ConfigError: the task has no model of MuJoCo, or OpenGL cannot be had.
@@ -37,6 +37,6 @@ class Pictures:
         self._stage.close()
 
     def of(self, state: EnvState) -> tuple[Image, ...]:
-        """A picture of each of N worlds."""
+        """A picture of each of N environments."""
         # The next picture is drawn into the same memory.
         return tuple(self._stage.picture(one).copy() for one in np.asarray(self._qpos(state)))

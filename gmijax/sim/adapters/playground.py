@@ -48,7 +48,7 @@ def make(
     Args:
       name: one of `gmijax.config.env.ROBOTS` or of `mujoco_playground.registry.ALL_ENVS`.
       impl: `auto`, `jax` or `warp`.
-      max_envs: most worlds at once; MJX-Warp's buffer of contacts is for so many.
+      max_envs: most environments at once; MJX-Warp's buffer of contacts is for so many.
       rewards: weights of terms of the reward by name.
       settings: numbers by name: those of `gmijax.sim.robots`, or of Playground's configuration
         with dots between groups.
@@ -122,7 +122,7 @@ def _by_name(tree: PyTree) -> dict[str, Any]:
 
 @contextmanager
 def _with_leaves(theirs: Any, leaves: Mapping[str, Array] | tuple[()]) -> Iterator[None]:
-    """Within it the model of `theirs` has these leaves, drawn for one world.
+    """Within it the model of `theirs` has these leaves, drawn for one environment.
 
     As in Playground's own wrapper. A tracer that stayed there would break what is traced next.
     """
@@ -175,7 +175,7 @@ def _converted(defaults: Mapping[str, Any], key: str, value: float) -> bool | in
 def _buffers(registry: Any, task: str, config: Any, max_envs: int | None) -> dict[str, int]:
     """Sizes of MJX-Warp's buffers, by their keys in Playground's configuration.
 
-    That for contacts is for all worlds; theirs is for as many as they train with.
+    That for contacts is for all environments; theirs is for as many as they train with.
     """
     suites = ("locomotion", "manipulation", "dm_control_suite")
     suite = next((one for one in suites if task in getattr(registry, one).ALL_ENVS), None)
@@ -225,7 +225,7 @@ def _with_overflow(env: Env) -> Env:
 def without_warnings(theirs: Any) -> Any:
     """`theirs` in MJX-Warp, changed not to print.
 
-    Else there is a line for every world and step that reaches the limit of the solver's
+    Else there is a line for every environment and step that reaches the limit of the solver's
     iterations, which their models mean to reach.
     """
     theirs._mjx_model = theirs.mjx_model.tree_replace({"opt._impl.warn_overflow": 0})

@@ -16,7 +16,7 @@ _KEY = "gmijax_key"
 
 
 class BraxEnv(Env):
-    """One world of a gmijax environment with the interface of Brax.
+    """A single gmijax environment with the interface of Brax.
 
     It has no time limit: `brax.envs.training.wrap(env, episode_length=env.episode_length)` sets
     it, and `info["truncation"]`. `metrics` has every term of the reward as `reward/<name>`, which
@@ -24,7 +24,7 @@ class BraxEnv(Env):
     `info["task_metrics"]`. Where only the value function sees all of an observation it is a dict,
     as in Playground: `state` for the policy, `privileged_state` for the value function.
 
-    Brax's automatic reset goes back to the first start of a world, not to a new one.
+    Brax's automatic reset goes back to the first start of an environment, not to a new one.
     """
 
     def __init__(self, env: interface.Env) -> None:
@@ -37,7 +37,7 @@ class BraxEnv(Env):
         return _to_state(self._env.spec, self._env.reset(self._env.model, rng), {}, {})
 
     def step(self, state: State, action: Array) -> State:
-        """One control step of one world under `action` [A]."""
+        """One control step of one environment under `action` [A]."""
         # The key is kept outside of what Brax's reset brings back: each episode draws anew.
         before: Any = state.pipeline_state
         key = jax.random.wrap_key_data(state.info[_KEY])

@@ -39,9 +39,9 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
     """N environments that are stepped by one compiled program.
 
     Rewards are float32 [N], terminations and truncations bool [N], actions are clipped to
-    [-1, 1]. `info["is_diverged"]` [N] says which worlds were ended because of a bad number, an
-    action that is NaN among them; they count as terminated. The same seed gives the same episodes
-    on the same machine.
+    [-1, 1]. `info["is_diverged"]` [N] says which environments were ended because of a bad number,
+    an action that is NaN among them; they count as terminated. The same seed gives the same
+    episodes on the same machine.
 
     With `autoreset="same_step"` the observations of a step are those to act on next, and where
     the mask `info["_final_obs"]` [N] is true `info["final_obs"]` [N, O] is the last one of the
@@ -50,8 +50,8 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
     entries are there if an episode has ended; with arrays on a device, where asking would wait
     for it, in every step.
 
-    With `autoreset="disabled"` a world that has ended stays at its end, with reward 0, until
-    `reset(options={"reset_mask": mask})` is called with a mask [N] that is true for it.
+    With `autoreset="disabled"` an environment that has ended stays at its end, with reward 0,
+    until `reset(options={"reset_mask": mask})` is called with a mask [N] that is true for it.
 
     Attributes:
       episode_length: steps after which an episode is truncated.
@@ -99,11 +99,11 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
         """Starts new episodes; without a seed others than before.
 
         Args:
-          seed: for all worlds, or a list with one for each, None for any.
-          options: `{"reset_mask": mask}`, bool [N]: only there; the other worlds go on.
+          seed: for all environments, or a list with one for each, None for any.
+          options: `{"reset_mask": mask}`, bool [N]: only there; the other environments go on.
 
         Returns:
-          Observations [N, O] of all worlds, and an empty dict.
+          Observations [N, O] of all environments, and an empty dict.
         """
         options = options or {}
         if unknown := options.keys() - {RESET_MASK}:
@@ -118,7 +118,7 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
         return hand_out(jnp.copy(state.env.obs), self._arrays), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One control step of all worlds under actions [N, A]."""
+        """One control step of all environments under actions [N, A]."""
         state = self._running()
         actions = take_in(actions)
         if actions.shape != self.action_space.shape:
@@ -133,11 +133,11 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
         return out.obs, out.reward, out.terminated, out.truncated, info
 
     def render(self) -> tuple[Image, ...] | None:
-        """A picture [height, width, 3] of every world as it is now; None without a render_mode."""
+        """A picture [height, width, 3] of every environment now; None without a render_mode."""
         return None if self._pictures is None else self._pictures.of(self._running().env)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        """An attribute of every world, or what its method returns, as of `SyncVectorEnv`.
+        """An attribute of every environment, or what its method returns, as of `SyncVectorEnv`.
 
         skrl draws by it after every step, whether or not there is a render_mode.
         """
@@ -168,7 +168,7 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
 
     @property
     def state(self) -> BatchState:
-        """All worlds; a bridge to another library may change its parts."""
+        """All environments; a bridge to another library may change its parts."""
         return self._running()
 
     @state.setter
@@ -186,7 +186,7 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
             return env_keys(jax.random.key(self._any_seed()), 0, self.num_envs)
         if len(seed) != self.num_envs:
             raise gym.error.Error(f"{len(seed)} seeds: expected one for each of {self.num_envs}")
-        # What a world draws depends on its own seed, which may be any natural number.
+        # What an environment draws depends on its own seed, which may be any natural number.
         own = [self._any_seed() if one is None else int(one) for one in seed]
         words = [np.random.SeedSequence(one).generate_state(1)[0] for one in own]
         return jax.vmap(jax.random.key)(np.asarray(words, np.uint32))

@@ -12,9 +12,9 @@ from gmijax.sim.stage import Image
 
 
 class GmijaxEnv(gym.Env[np.ndarray, np.ndarray]):
-    """The only world of `envs`, which has numpy arrays and no autoreset.
+    """The only environment of `envs`, which has numpy arrays and no autoreset.
 
-    It costs a call of a compiled program for every step of one world: train with
+    It costs a call of a compiled program for every step of one environment: train with
     `gmijax.make_vector_env`.
     """
 
@@ -41,6 +41,6 @@ class GmijaxEnv(gym.Env[np.ndarray, np.ndarray]):
         return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> Image | None:
-        """A picture [height, width, 3] of the world; None without a render_mode."""
+        """A picture [height, width, 3] of the environment; None without a render_mode."""
         pictures = self._envs.render()
         return None if pictures is None else pictures[0]

@@ -44,7 +44,7 @@ class RslRlVecEnv(VecEnv):
         self.device = self._obs.device
 
     def reset(self, seed: int | None = None) -> tuple[TensorDict, dict[str, Any]]:
-        """Starts new episodes in all worlds; without a seed others than before."""
+        """Starts new episodes in all environments; without a seed others than before."""
         self._obs, _ = self.envs.reset(seed=seed)
         return self.get_observations(), {}
 
@@ -59,7 +59,7 @@ class RslRlVecEnv(VecEnv):
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """One control step of all worlds under actions [N, A]."""
+        """One control step of all environments under actions [N, A]."""
         self._obs, reward, terminated, truncated, info = self.envs.step(actions)
         extras = {
             "time_outs": truncated,

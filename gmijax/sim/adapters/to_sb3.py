@@ -17,7 +17,7 @@ from gmijax.sim.interface import Env
 class Sb3VecEnv(VecEnv):
     """N environments for Stable-Baselines3, which logs their returns as those of a `Monitor`.
 
-    Worlds are no objects of their own: `get_attr` gives the same value for all of them, and
+    Environments are no objects of their own: `get_attr` gives the same value for all of them, and
     there is nothing for `env_method` to call.
     """
 
@@ -28,7 +28,7 @@ class Sb3VecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
-        """Starts new episodes in all worlds; from the seeds of `seed`, if it was called."""
+        """Starts new episodes in all environments; from the seeds of `seed`, if it was called."""
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
         obs, _ = self.envs.reset(seed=seeds)
         self._reset_seeds()
@@ -40,17 +40,17 @@ class Sb3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> Any:
-        """One control step of all worlds."""
+        """One control step of all environments."""
         obs, reward, terminated, truncated, info = self.envs.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = terminated | truncated
-        for world in np.flatnonzero(ended):
+        for index in np.flatnonzero(ended):
             final = info["final_info"]
-            episode = {key: final["episode"][key][world].item() for key in ("r", "l")}
-            infos[world] = {
-                "terminal_observation": info["final_obs"][world],
-                "TimeLimit.truncated": bool(truncated[world]),
-                "is_diverged": bool(final["is_diverged"][world]),
+            episode = {key: final["episode"][key][index].item() for key in ("r", "l")}
+            infos[index] = {
+                "terminal_observation": info["final_obs"][index],
+                "TimeLimit.truncated": bool(truncated[index]),
+                "is_diverged": bool(final["is_diverged"][index]),
                 "episode": episode | {"t": round(time.time() - self._start_s, 6)},
             }
         return obs, reward, ended, infos
@@ -60,15 +60,15 @@ class Sb3VecEnv(VecEnv):
         self.envs.close()
 
     def get_images(self) -> Sequence[np.ndarray]:
-        """A picture of every world."""
+        """A picture of every environment."""
         return self.envs.render() or ()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """An attribute of the environments, once for each of `indices`."""
-        return [getattr(self.envs, attr_name)] * len(self._worlds(indices))
+        return [getattr(self.envs, attr_name)] * len(self._indices(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refused: worlds have no attributes of their own."""
+        """Refused: environments have no attributes of their own."""
         raise AttributeError(
             f"{attr_name}: environments share one program, and have no attributes"
         )
@@ -76,16 +76,16 @@ class Sb3VecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Refused: worlds have no methods of their own."""
+        """Refused: environments have no methods of their own."""
         raise AttributeError(
             f"{method_name}(): environments share one program, and have no methods"
         )
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """True for `Monitor`, whose entry in `infos` is there."""
-        return [issubclass(wrapper_class, Monitor)] * len(self._worlds(indices))
+        return [issubclass(wrapper_class, Monitor)] * len(self._indices(indices))
 
-    def _worlds(self, indices: Any) -> Sequence[int]:
+    def _indices(self, indices: Any) -> Sequence[int]:
         return list(self._get_indices(indices))
 
 

@@ -8,23 +8,23 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.sim.interface import Env
-from gmijax.sim.wrappers import BatchedEnv, BatchState, select_worlds, training_env
+from gmijax.sim.wrappers import BatchedEnv, BatchState, select_envs, training_env
 from gmijax.types import Array, PRNGKey, PyTree
 
 Autoreset: TypeAlias = Literal["same_step", "next_step", "disabled"]
-"""When a world that has ended starts over: in the step that ended it, in the next step, whose
-action does nothing there, or when `reset` is called for it."""
+"""When an environment that has ended starts over: in the step that ended it, in the next step,
+whose action does nothing there, or when `reset` is called for it."""
 
 
 class VectorOutcome(NamedTuple):
-    """What one step of N worlds is for the caller.
+    """What one step of N environments is for the caller.
 
     Attributes:
       obs: [N, O] float32, what to act on next.
       reward: [N] float32.
       terminated: [N] bool, the task has ended.
       truncated: [N] bool, time ran out.
-      is_diverged: [N] bool, the world was ended because of a bad number; it is terminated.
+      is_diverged: [N] bool, the environment was ended because of a bad number; it is terminated.
       final_obs: [N, O] float32, what the action led to, before any reset.
       episode_return: [N] float32, sum of the rewards of the episode with this step.
       episode_length: [N] int32, its steps.
@@ -41,10 +41,10 @@ class VectorOutcome(NamedTuple):
 
 
 class VectorPrograms:
-    """N worlds as two compiled programs. Their states are on `device`, and stay there.
+    """N environments as two compiled programs. Their states are on `device`, and stay there.
 
     Args:
-      env: one world with a time limit.
+      env: one environment with a time limit.
       autoreset: see `Autoreset`.
       random_ep_len: whether `BatchState.head_start` shortens first episodes.
     """
@@ -54,14 +54,14 @@ class VectorPrograms:
         self.device = jnp.zeros(()).device
         self._model = jax.device_put(env.model, self.device)
         self._init = jax.jit(batched.init)
-        self._select = jax.jit(select_worlds)
+        self._select = jax.jit(select_envs)
         step = _same_step if autoreset == "same_step" else _held
         self._step = jax.jit(
             lambda model, state, actions: step(batched, autoreset, model, state, actions)
         )
 
     def start(self, keys: PRNGKey) -> BatchState:
-        """New episodes in all worlds, from keys [N]."""
+        """New episodes in all environments, from keys [N]."""
         state = self._init(self._model, keys)
         # Without a head start for anybody; who wants one sets it.
         state = state._replace(head_start=jnp.zeros_like(state.head_start))
@@ -69,7 +69,7 @@ class VectorPrograms:
         return jax.device_put(state, self.device)
 
     def start_some(self, state: BatchState, keys: PRNGKey, chosen: Array) -> BatchState:
-        """New episodes in the worlds that are `chosen` [N] bool."""
+        """New episodes in the environments that are `chosen` [N] bool."""
         chosen = jax.device_put(chosen, self.device)
         return self._select(chosen, self.start(keys), state)
 
@@ -97,11 +97,11 @@ def _same_step(
 def _held(
     batched: BatchedEnv, autoreset: Autoreset, model: PyTree, state: BatchState, actions: Array
 ) -> tuple[BatchState, VectorOutcome]:
-    """Worlds that had ended before this step are not stepped: they start over, or stay."""
+    """Environments that had ended before this step are not stepped: they start over, or stay."""
     had_ended = state.env.terminated | state.env.truncated
     stepped, out = batched.advance(model, state, actions)
     held = state if autoreset == "disabled" else batched.restart(model, state)
-    after = select_worlds(had_ended, held, stepped)
+    after = select_envs(had_ended, held, stepped)
     return after, VectorOutcome(
         obs=after.env.obs,
         reward=jnp.where(had_ended, 0.0, out.reward),

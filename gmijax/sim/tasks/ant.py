@@ -76,13 +76,13 @@ def make(
 ) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(AntSettings, settings)
-    world = simulators.load("ant", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
-    ids = runner.look_up(world.mj_model, JOINTS, SENSORS)
+    sim = simulators.load("ant", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    ids = runner.look_up(sim.mj_model, JOINTS, SENSORS)
     spec = EnvSpec(
         name="ant",
         obs_size=OBS_SIZE,
         action_size=ACTION_SIZE,
-        control_dt_s=world.control_dt_s,
+        control_dt_s=sim.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(terms, DEATH),
         max_abs_obs=MAX_ABS_OBS,
@@ -92,24 +92,24 @@ def make(
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         key, draw = draws.split(key)
-        start = world.start(*runner.draw_start(ids, world.mj_model, draw, chosen))
+        start = sim.start(*runner.draw_start(ids, sim.mj_model, draw, chosen))
         # Sensors read zero: a reset runs no physics, see `Physics.start`.
         zeros = constant(np.zeros(len(ids.sensors))), constant(np.zeros(ACTION_SIZE))
         return episode.begin(spec, start, (), observe(runner.pose_of(ids, start), *zeros), key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         action = action.clip(-1.0, 1.0)
-        moved, sensordata = world.step(model, state.physics, action)
+        moved, sensordata = sim.step(model, state.physics, action)
         pose = runner.pose_of(ids, moved)
-        speed = runner.speed_to_target(state.physics, moved, world.control_dt_s)
+        speed = runner.speed_to_target(state.physics, moved, sim.control_dt_s)
         view = AntView(pose, action, speed)
         dead = pose.position[2] < chosen.death_height_m
         reward = total_reward(terms, view, Replacement(DEATH, dead, chosen.death_reward))
         obs = observe(pose, sensordata[ids.sensors], action)
-        metrics = {runner.SPEED: runner.mean_speed(pose, state.steps + 1, world.control_dt_s)}
+        metrics = {runner.SPEED: runner.mean_speed(pose, state.steps + 1, sim.control_dt_s)}
         return episode.advance(state, moved, (), obs, reward, dead, metrics)
 
-    return world.env(spec, reset, step)
+    return sim.env(spec, reset, step)
 
 
 def observe(pose: RunnerPose, foot_sensors: Array, action: Array) -> Array:

@@ -132,28 +132,18 @@ def make(
 ) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`.
 
-    With `curriculum` the commands of a world begin with a part of their ranges, which grows with
-    every episode that succeeds.
+    With `curriculum` the commands of an environment begin with a part of their ranges, which grows
+    with every episode that succeeds.
     """
     terms, chosen = with_weights(TERMS, rewards), settings_from(AnymalSettings, settings)
-    world = simulators.load("anymal", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
-    ids = look_up(world.mj_model)
-    # A number that is not finite outlives the clipping of observations or shows in `qpos`, so
-    # `max_abs_obs` need not be told.
-    spec = EnvSpec(
-        name="anymal",
-        obs_size=OBS_SIZE,
-        action_size=ACTION_SIZE,
-        control_dt_s=world.control_dt_s,
-        episode_length=DEFAULT_EPISODE_LENGTH,
-        reward_terms=term_names(terms, FLOOR),
-        metrics=(*METRICS, SHARE) if curriculum else METRICS,
-        obs_terms=OBS_TERMS,
-    )
+    sim = simulators.load("anymal", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    ids = look_up(sim.mj_model)
+    metrics = (*METRICS, SHARE) if curriculum else METRICS
+    spec = make_spec(sim.control_dt_s, term_names(terms, FLOOR), metrics)
 
     def begin(key: PRNGKey, share: Array | None) -> EnvState:
         key, start_key, command_key = draws.split(key, 3)
-        start = world.start(*draw_start(ids, world.mj_model, start_key, chosen))
+        start = sim.start(*draw_start(ids, sim.mj_model, start_key, chosen))
         command = draw_command(command_key, chosen, share)
         zero = array_module(command).zeros((), np.float32)
         task = AnymalTask(command, zero, zero, share)
@@ -168,7 +158,7 @@ def make(
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         action = action.clip(-1.0, 1.0)
-        moved, (torques, knees) = world.step(
+        moved, (torques, knees) = sim.step(
             model,
             state.physics,
             constant(ids.standing) + chosen.action_scale_rad * action,
@@ -181,8 +171,28 @@ def make(
         down = has_fallen(moved, knees)
         return episode.advance(state, moved, task, obs, reward, down, metrics)
 
-    env = world.env(spec, reset, step)
+    env = sim.env(spec, reset, step)
     return env._replace(next_episode=next_episode) if curriculum else env
+
+
+def make_spec(
+    control_dt_s: float, reward_terms: tuple[str, ...], metrics: tuple[str, ...]
+) -> EnvSpec:
+    """What the task is, whatever moves it.
+
+    A number that is not finite outlives the clipping of observations or shows in `qpos`, so
+    `max_abs_obs` is left open.
+    """
+    return EnvSpec(
+        name="anymal",
+        obs_size=OBS_SIZE,
+        action_size=ACTION_SIZE,
+        control_dt_s=control_dt_s,
+        episode_length=DEFAULT_EPISODE_LENGTH,
+        reward_terms=reward_terms,
+        metrics=metrics,
+        obs_terms=OBS_TERMS,
+    )
 
 
 def look_up(mj_model: mujoco.MjModel) -> AnymalIds:

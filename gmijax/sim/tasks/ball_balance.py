@@ -99,13 +99,13 @@ def make(
 ) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(BallBalanceSettings, settings)
-    world = simulators.load("ball_balance", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
-    ids = look_up(world.mj_model)
+    sim = simulators.load("ball_balance", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    ids = look_up(sim.mj_model)
     spec = EnvSpec(
         name="ball_balance",
         obs_size=OBS_SIZE,
         action_size=ACTION_SIZE,
-        control_dt_s=world.control_dt_s,
+        control_dt_s=sim.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(terms),
         max_abs_obs=MAX_ABS_OBS,
@@ -114,16 +114,16 @@ def make(
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         key, draw = draws.split(key)
-        start = world.start(*draw_start(ids, world.mj_model, draw, chosen))
+        start = sim.start(*draw_start(ids, sim.mj_model, draw, chosen))
         # Sensors read zero: a reset runs no physics, see `Physics.start`.
         obs = observe(ids, start, constant(np.zeros(len(ids.sensors))))
         targets = array_module(obs).zeros(ACTION_SIZE, np.float32)
         return episode.begin(spec, start, BallBalanceTask(targets), obs, key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
-        change = chosen.action_speed_rad_per_s * world.control_dt_s * action.clip(-1.0, 1.0)
+        change = chosen.action_speed_rad_per_s * sim.control_dt_s * action.clip(-1.0, 1.0)
         targets = (state.task.targets + change).clip(ids.knees.lower, ids.knees.upper)
-        moved, sensordata = world.step(model, state.physics, targets)
+        moved, sensordata = sim.step(model, state.physics, targets)
         ball, ball_velocity = ball_of(ids, moved)
         goal = constant((0.0, 0.0, chosen.goal_height_m))
         reward = total_reward(terms, BallBalanceView(ball, ball_velocity, goal))
@@ -131,7 +131,7 @@ def make(
         fallen = ball[2] < chosen.fallen_height_m
         return episode.advance(state, moved, BallBalanceTask(targets), obs, reward, fallen)
 
-    return world.env(spec, reset, step)
+    return sim.env(spec, reset, step)
 
 
 def look_up(mj_model: mujoco.MjModel) -> BallBalanceIds:

@@ -176,13 +176,13 @@ def make(
 ) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(FrankaCabinetSettings, settings)
-    world = simulators.load("franka_cabinet", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
-    ids, speeds = look_up(world.mj_model), action_speeds(chosen)
+    sim = simulators.load("franka_cabinet", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    ids, speeds = look_up(sim.mj_model), action_speeds(chosen)
     spec = EnvSpec(
         name="franka_cabinet",
         obs_size=OBS_SIZE,
         action_size=ACTION_SIZE,
-        control_dt_s=world.control_dt_s,
+        control_dt_s=sim.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(terms, BEHIND),
         metrics=("drawer_m", "opened"),
@@ -191,17 +191,17 @@ def make(
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         key, draw = draws.split(key)
-        qpos = draw_start(ids, world.mj_model, draw, chosen)
-        start = world.start(qpos, array_module(qpos).zeros(world.mj_model.nv, np.float32))
-        obs = observe(ids, start, pose_of(ids, *world.poses(start.qpos)))
+        qpos = draw_start(ids, sim.mj_model, draw, chosen)
+        start = sim.start(qpos, array_module(qpos).zeros(sim.mj_model.nv, np.float32))
+        obs = observe(ids, start, pose_of(ids, *sim.poses(start.qpos)))
         task = FrankaCabinetTask(start.qpos[ids.joints.qpos])
         return episode.begin(spec, start, task, obs, key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         action = action.clip(-1.0, 1.0)
-        change = speeds * world.control_dt_s * action
+        change = speeds * sim.control_dt_s * action
         targets = (state.task.targets + change).clip(ids.joints.lower, ids.joints.upper)
-        moved, poses = world.step(
+        moved, poses = sim.step(
             model, state.physics, targets, lambda data: (data.xpos, data.xquat)
         )
         pose, drawer_m = pose_of(ids, *poses), moved.qpos[ids.drawer_joint.qpos[0]]
@@ -216,7 +216,7 @@ def make(
         terminated, truncated = ends(opened, chosen)
         return episode.advance(state, moved, task, obs, reward, terminated, metrics, truncated)
 
-    return world.env(spec, reset, step)
+    return sim.env(spec, reset, step)
 
 
 def ends(opened: Array, settings: FrankaCabinetSettings) -> tuple[Array, Array]:

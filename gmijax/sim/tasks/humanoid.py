@@ -103,14 +103,14 @@ def make(
 ) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(HumanoidSettings, settings)
-    world = simulators.load("humanoid", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
-    ids = runner.look_up(world.mj_model, JOINTS, SENSORS)
-    strength = motor_strength(world.mj_model)
+    sim = simulators.load("humanoid", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    ids = runner.look_up(sim.mj_model, JOINTS, SENSORS)
+    strength = motor_strength(sim.mj_model)
     spec = EnvSpec(
         name="humanoid",
         obs_size=OBS_SIZE,
         action_size=ACTION_SIZE,
-        control_dt_s=world.control_dt_s,
+        control_dt_s=sim.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(terms, DEATH),
         max_abs_obs=MAX_ABS_OBS,
@@ -120,7 +120,7 @@ def make(
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         key, draw = draws.split(key)
-        start = world.start(*runner.draw_start(ids, world.mj_model, draw, chosen))
+        start = sim.start(*runner.draw_start(ids, sim.mj_model, draw, chosen))
         # Forces read zero: a reset runs no physics, see `Physics.start`.
         zeros = constant(np.zeros(ACTION_SIZE))
         sensors = constant(np.zeros(len(ids.sensors)))
@@ -129,22 +129,22 @@ def make(
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         action = action.clip(-1.0, 1.0)
-        moved, (forces, sensors) = world.step(
+        moved, (forces, sensors) = sim.step(
             model,
             state.physics,
             action,
             lambda data: (data.qfrc_actuator[ids.joints.qvel], data.sensordata[ids.sensors]),
         )
         pose = runner.pose_of(ids, moved)
-        speed = runner.speed_to_target(state.physics, moved, world.control_dt_s)
+        speed = runner.speed_to_target(state.physics, moved, sim.control_dt_s)
         view = HumanoidView(pose, action, speed, constant(strength))
         dead = pose.position[2] < chosen.death_height_m
         reward = total_reward(terms, view, Replacement(DEATH, dead, chosen.death_reward))
         obs = observe(pose, forces, sensors, action)
-        metrics = {runner.SPEED: runner.mean_speed(pose, state.steps + 1, world.control_dt_s)}
+        metrics = {runner.SPEED: runner.mean_speed(pose, state.steps + 1, sim.control_dt_s)}
         return episode.advance(state, moved, (), obs, reward, dead, metrics)
 
-    return world.env(spec, reset, step)
+    return sim.env(spec, reset, step)
 
 
 def motor_strength(mj_model: mujoco.MjModel) -> npt.NDArray[np.float32]:

@@ -161,13 +161,13 @@ def make(
 ) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(ShadowHandSettings, settings)
-    world = simulators.load("shadow_hand", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
-    ids = look_up(world.mj_model)
+    sim = simulators.load("shadow_hand", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    ids = look_up(sim.mj_model)
     spec = EnvSpec(
         name="shadow_hand",
         obs_size=OBS_SIZE,
         action_size=ACTION_SIZE,
-        control_dt_s=world.control_dt_s,
+        control_dt_s=sim.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(terms),
         metrics=("successes", "rotation_error_rad"),
@@ -176,18 +176,18 @@ def make(
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         key, start_key, goal_key = draws.split(key, 3)
-        qpos = draw_start(ids, world.mj_model, start_key, chosen)
+        qpos = draw_start(ids, sim.mj_model, start_key, chosen)
         xp = array_module(qpos)
-        start = world.start(qpos, xp.zeros(world.mj_model.nv, np.float32))
+        start = sim.start(qpos, xp.zeros(sim.mj_model.nv, np.float32))
         task = ShadowHandTask(draw_rotation(goal_key), xp.zeros((), np.float32))
-        touch = touch_at_rest(ids, *world.poses(qpos))
+        touch = touch_at_rest(ids, *sim.poses(qpos))
         obs = observe(ids, start, touch, task.goal, constant(np.zeros(ACTION_SIZE)))
         return episode.begin(spec, start, task, obs, key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         action = action.clip(-1.0, 1.0)
         targets = targets_of(ids, action)
-        moved, touch = world.step(model, state.physics, targets, lambda data: touch_of(ids, data))
+        moved, touch = sim.step(model, state.physics, targets, lambda data: touch_of(ids, data))
         view = view_of(ids, moved, state.task.goal, action, chosen.reached_rad)
         reward = total_reward(terms, view)
         task, key = next_goal(state.task, view.reached, state.key)
@@ -197,7 +197,7 @@ def make(
         after = episode.advance(state, moved, task, obs, reward, fallen, metrics)
         return after._replace(key=key)
 
-    return world.env(spec, reset, step)
+    return sim.env(spec, reset, step)
 
 
 def look_up(mj_model: mujoco.MjModel) -> ShadowHandIds:
@@ -236,7 +236,7 @@ def draw_start(
 
 
 def next_goal(task: ShadowHandTask, reached: Array, key: PRNGKey) -> tuple[ShadowHandTask, Array]:
-    """Another goal where the last one is reached; only then the world's key moves on."""
+    """Another goal where the last one is reached; only then the environment's key moves on."""
     moved_on, draw = draws.split(key)
     goal = array_module(reached).where(reached, draw_rotation(draw), task.goal)
     task = ShadowHandTask(goal, task.successes + reached)

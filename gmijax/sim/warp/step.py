@@ -1,7 +1,7 @@
 """A control step of MuJoCo Warp as one call of a JAX program.
 
-JAX hands over what drives the worlds and what they must remember, as one array, and gets back what
-has become of it and what the task reads. All else of MuJoCo's data stays with Warp
+JAX hands over what drives the environments and what they must remember, as one array, and gets
+back what has become of it and what the task reads. All else of MuJoCo's data stays with Warp
 (docs/decisions/sim-warp-step.md).
 """
 
@@ -18,18 +18,18 @@ import mujoco
 from mujoco.mjx import warp as mjx_warp
 
 from gmijax.sim.impl import WarpSizes
-from gmijax.sim.warp.sizes import Bounds, bounds_of
-from gmijax.sim.warp.worlds import (
+from gmijax.sim.warp.batch import (
     MODEL_LEAVES,
     MOVED,
     OVERFLOW,
     STATE,
     BufferField,
     BufferLayout,
-    Worlds,
+    WarpBatch,
     lay_out,
     name_of,
 )
+from gmijax.sim.warp.sizes import Bounds, bounds_of
 from gmijax.types import Array, PyTree
 
 T = TypeVar("T")
@@ -39,14 +39,14 @@ Arrays: TypeAlias = dict[str, Array]
 
 @dataclass(frozen=True, eq=False)
 class WarpStep:
-    """Control steps of a model, for any number of worlds.
+    """Control steps of a model, for any number of environments.
 
     Attributes:
       mj_model: the model.
       substeps: physics steps of a control step.
       sizes: of the buffers for contacts and constraints.
-      shapes: of the arrays that MuJoCo Warp's data have for each world, by name.
-      bounds: what no state of a world can exceed; None if nobody asked.
+      shapes: of the arrays that MuJoCo Warp's data have for each environment, by name.
+      bounds: what no state of an environment can exceed; None if nobody asked.
     """
 
     mj_model: mujoco.MjModel
@@ -80,14 +80,14 @@ class WarpStep:
     def __call__(
         self, model: PyTree, state: Arrays, ctrl: Array, read: Callable[[Any], T]
     ) -> tuple[Arrays, T]:
-        """Moves one world; under `jax.vmap` all of them, in one call.
+        """Moves one environment; under `jax.vmap` all of them, in one call.
 
         Args:
           model: an `mjx.Model`, of which `MODEL_LEAVES` count.
           state: the arrays of `STATE`, and what else is carried, by name.
           ctrl: [nu].
           read: what the task wants of the data afterwards. They have the arrays of
-            `mujoco_warp.Data` that have float32 numbers for each world.
+            `mujoco_warp.Data` that have float32 numbers for each environment.
 
         Returns:
           The arrays of `STATE` and `MOVED` that it was given, `OVERFLOW` [] int32, and what `read`
@@ -100,7 +100,7 @@ class WarpStep:
         leaves = {name: getattr(model, name) for name in MODEL_LEAVES}
         given = {"ctrl": ctrl, **{n: leaf for n, leaf in leaves.items() if leaf.size}, **state}
         alone = {name: array[None] for name, array in given.items()}
-        out = {name: array[0] for name, array in self._of_worlds(reads)(alone).items()}
+        out = {name: array[0] for name, array in self._over_envs(reads)(alone).items()}
         reading = read(Readings((drives | out).__getitem__))
         return {name: out[name] for name in (*moving(state), OVERFLOW)}, reading
 
@@ -110,14 +110,14 @@ class WarpStep:
         wanted.append(name)
         return jnp.zeros(self.shapes[name])
 
-    def _of_worlds(self, reads: tuple[str, ...]) -> Callable[[Arrays], Arrays]:
-        """`launch` as a function over which `jax.vmap` makes one call of more worlds."""
+    def _over_envs(self, reads: tuple[str, ...]) -> Callable[[Arrays], Arrays]:
+        """`launch` as a function over which `jax.vmap` makes one call of more environments."""
 
         @jax.custom_batching.custom_vmap
-        def worlds(given: Arrays) -> Arrays:
+        def call(given: Arrays) -> Arrays:
             return self.launch(reads, given)
 
-        @worlds.def_vmap
+        @call.def_vmap
         def _(size: int, is_mapped: list[dict[str, bool]], given: Arrays) -> Any:
             (mapped,) = is_mapped
             count = given["qpos"].shape[int(mapped["qpos"])]
@@ -125,19 +125,17 @@ class WarpStep:
                 name: _folded(name, array, (size, count), mapped[name])
                 for name, array in given.items()
             }
-            out = {
-                name: x.reshape(size, count, *x.shape[1:]) for name, x in worlds(folded).items()
-            }
+            out = {name: x.reshape(size, count, *x.shape[1:]) for name, x in call(folded).items()}
             return out, dict.fromkeys(out, True)
 
-        return worlds
+        return call
 
     def launch(self, reads: tuple[str, ...], given: Arrays) -> Arrays:
-        """Steps N worlds.
+        """Steps N environments.
 
         Args:
           reads: names of arrays of the data, beside those that it is given.
-          given: arrays with a leading axis [N]; leaves that worlds share have [1].
+          given: arrays with a leading axis [N]; leaves that environments share have [1].
         """
         count = given["qpos"].shape[0]
         state = moving(given)
@@ -155,7 +153,7 @@ class WarpStep:
 
 
 class Readings:
-    """Stands for the data where a task reads them; every attribute is an array of one world."""
+    """Stands for the data where a task reads them; attributes are arrays of one environment."""
 
     def __init__(self, array: Callable[[str], Array]) -> None:
         self._array = array
@@ -180,7 +178,7 @@ def joined(layout: BufferLayout, given: Mapping[str, Array]) -> Array:
 
 
 def _folded(name: str, array: Array, shape: tuple[int, int], is_mapped: bool) -> Array:
-    """An array of K times N worlds, `shape`; the only row of a leaf that all share stays that."""
+    """An array of K times N environments, `shape`; a leaf that all share keeps its only row."""
     if not is_mapped:
         if name in MODEL_LEAVES and array.shape[0] == 1:
             return array
@@ -196,13 +194,13 @@ Pieces: TypeAlias = tuple[tuple[str, BufferField], ...]
 def _target(source: WarpStep, given: Pieces, taken: Pieces) -> Callable[[Array], Any]:
     """What a program calls: from the part of the buffer that goes in to the one that comes out."""
     layout = BufferLayout(dict(given), dict(taken))
-    worlds: dict[str, Worlds] = {}
+    batches: dict[str, WarpBatch] = {}
 
     def control_step(given: Any, taken: Any) -> None:
         device = given.device.alias
-        if device not in worlds:
-            worlds[device] = Worlds(source.mj_model, source.substeps, source.sizes, layout)
-        worlds[device].step(given, taken)
+        if device not in batches:
+            batches[device] = WarpBatch(source.mj_model, source.substeps, source.sizes, layout)
+        batches[device].step(given, taken)
 
     vector = mjx_warp.warp.array(dtype=float)
     control_step.__annotations__ = {"given": vector, "taken": vector}
@@ -212,6 +210,6 @@ def _target(source: WarpStep, given: Pieces, taken: Pieces) -> Callable[[Array],
     )
     return mjx_warp.warp.jax_callable(
         control_step,
-        graph_mode=mjx_warp.warp.JaxCallableGraphMode.NONE,  # `Worlds` has the graph.
+        graph_mode=mjx_warp.warp.JaxCallableGraphMode.NONE,  # `WarpBatch` has the graph.
         output_dims={"taken": layout.size - layout.first_taken},
     )

@@ -1,4 +1,4 @@
-"""Worlds of MuJoCo Warp, their data in Warp's memory, and the buffer through which JAX moves them.
+"""A batch of environments in Warp's memory, and the buffer through which JAX steps them.
 
 The package warp-lang is optional, and MJX has tried to import it: hence `mjx_warp.warp`.
 """
@@ -44,11 +44,12 @@ _ALIGNED = 64
 
 _UNASKED = 8
 """Up to so many iterations of the solver are done without asking after each of them whether all
-worlds have an answer: a GPU waits for that, and of two to four, as in our tasks, it saves none."""
+environments have an answer: a GPU waits for that, and of two to four, as in our tasks, it saves
+none."""
 
 
 class BufferField(NamedTuple):
-    """An array in the buffer: its shape, worlds first, and where it begins, in floats."""
+    """An array in the buffer: its shape, environments first, and where it begins, in floats."""
 
     shape: tuple[int, ...]
     start: int
@@ -70,12 +71,12 @@ class BufferField(NamedTuple):
 
 
 class BufferLayout(NamedTuple):
-    """The buffer of N worlds: from its beginning on what goes in, to its end what comes out.
+    """The buffer of N environments: from its beginning on what goes in, to its end what comes out.
 
     The two parts overlap in the state.
 
     Attributes:
-      given: controls, leaves of the model, what drives the worlds, state.
+      given: controls, leaves of the model, what drives the environments, state.
       taken: state, overflow, what the task reads.
     """
 
@@ -114,8 +115,8 @@ def name_of(mj_model: mujoco.MjModel) -> str:
     return mj_model.names.split(b"\0")[0].decode()
 
 
-class Worlds:
-    """N worlds on Warp's current device.
+class WarpBatch:
+    """N environments on Warp's current device.
 
     Args:
       mj_model: their model.

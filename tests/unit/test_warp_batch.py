@@ -1,4 +1,4 @@
-"""Worlds of MuJoCo Warp on a GPU, which is faked: what goes in and out, and the graph."""
+"""Environments of MuJoCo Warp on a GPU, which is faked: what goes in and out, and the graph."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from fake_warp import FakeArray, FakeWarp
 
 from gmijax.sim.impl import WarpSizes
-from gmijax.sim.warp import worlds
-from gmijax.sim.warp.worlds import OVERFLOW, STATE, BufferLayout, Worlds, lay_out
+from gmijax.sim.warp import batch
+from gmijax.sim.warp.batch import OVERFLOW, STATE, BufferLayout, WarpBatch, lay_out
 
 COUNT, SUBSTEPS = 3, 2
 
@@ -28,12 +28,12 @@ def test_a_step_on_a_gpu_is_a_graph_from_what_is_given_to_what_is_taken(
 ):
     fake = FakeWarp()
     peaks: list[object] = []
-    monkeypatch.setattr(worlds, "mjx_warp", fake)
-    monkeypatch.setattr(worlds, "PEAKS_BESIDE_JAX", peaks)
-    worlds.count_memory.cache_clear()
+    monkeypatch.setattr(batch, "mjx_warp", fake)
+    monkeypatch.setattr(batch, "PEAKS_BESIDE_JAX", peaks)
+    batch.count_memory.cache_clear()
     layout = layout_with(mass_rows)
     model = SimpleNamespace(opt=SimpleNamespace(iterations=4))
-    made = Worlds(model, SUBSTEPS, WarpSizes(5, 9), layout)
+    made = WarpBatch(model, SUBSTEPS, WarpSizes(5, 9), layout)
     own = {"body_mass": COUNT} if mass_rows == COUNT else {}
     assert fake.made == [{"batch_sizes": own, "nworld": COUNT, "naconmax": 15, "njmax": 9}]
     assert not made.model.opt.graph_conditional
@@ -64,8 +64,8 @@ def test_a_step_on_a_gpu_is_a_graph_from_what_is_given_to_what_is_taken(
 def test_a_solver_with_many_iterations_asks_whether_it_is_done(
     iterations: int, asks: bool, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(worlds, "mjx_warp", FakeWarp())
-    monkeypatch.setattr(worlds, "PEAKS_BESIDE_JAX", [])
+    monkeypatch.setattr(batch, "mjx_warp", FakeWarp())
+    monkeypatch.setattr(batch, "PEAKS_BESIDE_JAX", [])
     model = SimpleNamespace(opt=SimpleNamespace(iterations=iterations))
-    made = Worlds(model, SUBSTEPS, WarpSizes(1, 1), layout_with(1))
+    made = WarpBatch(model, SUBSTEPS, WarpSizes(1, 1), layout_with(1))
     assert made.model.opt.graph_conditional is asks

@@ -1,0 +1,132 @@
+"""What a training job does with its run folder before, between and after its attempts.
+
+No jax here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gmijax.config import TrainConfig
+from gmijax.control.console import nearby
+from gmijax.control.start_point import StartPoint
+from gmijax.control.summary import train_summary
+from gmijax.partition.plan import Plan
+from gmijax.runs.folder import RunPaths, add_event, read_json, remove_temporary, write_json
+from gmijax.runs.git import record_git
+from gmijax.runs.held import OpenFolder, locked
+from gmijax.runs.history import copy_history, draw_returns, read_metrics
+from gmijax.runs.names import attempt_folders, gmi_folders
+from gmijax.runs.resume import (
+    CheckpointMeta,
+    checkpoints_of,
+    drop_unfinished,
+    find_checkpoint,
+)
+from gmijax.runs.saved_config import saved_config
+from gmijax.sim import source
+
+
+class HeldRun(NamedTuple):
+    """A run folder that a job holds."""
+
+    run: RunPaths
+    notes: Sequence[str]  # What the user should know of it.
+    folder: OpenFolder  # To see whether it is still there.
+
+
+@contextmanager
+def opened(config: TrainConfig, start_point: StartPoint) -> Iterator[HeldRun]:
+    """The run folder of a job, held while it is entered.
+
+    Raises:
+      ConfigError: as `StartPoint.open` and `locked`.
+    """
+    notes = start_point.notes
+    if start_point.checkpoint is not None:
+        changed = source.changes(config.env, saved_config(start_point.checkpoint)["env"])
+        notes = notes if changed is None else (changed, *notes)
+    run = start_point.open(config)
+    with locked(run.lock, f"run.dir={run.root}") as folder:
+        record_git(run, Path.cwd())
+        yield HeldRun(run, notes, folder)
+
+
+def keep_logs(run: RunPaths, attempt: int) -> None:
+    """Moves what the GMIs of a failed attempt have left out of the way of the next one's."""
+    for folder in gmi_folders(run.root):
+        kept = folder / f"attempt_{attempt}"
+        files = [path for path in folder.iterdir() if path.is_file()]
+        kept.mkdir(exist_ok=True)
+        for path in files:
+            path.rename(kept / path.name)
+
+
+def drop_half_written(run: RunPaths) -> None:
+    """Removes what a killed process has left of files and checkpoints that it was writing."""
+    gmis = gmi_folders(run.root)
+    attempts = [attempt for gmi in gmis for attempt in attempt_folders(gmi)]
+    for folder in (run.root, *gmis, *attempts):
+        remove_temporary(folder)
+    drop_unfinished(run)
+
+
+def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:
+    """Leaves of a run what belongs to a checkpoint.
+
+    No half-written files, no later metrics, and no results of GMIs, which are to train again.
+    """
+    for gmi in gmi_folders(run.root):
+        (gmi / "result.json").unlink(missing_ok=True)
+    drop_half_written(run)
+    # Written anew from the metrics: event files cannot be cut.
+    shutil.rmtree(run.tensorboard, ignore_errors=True)
+    steps = 0 if checkpoint is None else CheckpointMeta.read(checkpoint).env_steps
+    copy_history(run.metrics, run.metrics, steps)
+
+
+def started_from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
+    """The configuration with `run.resume` as the path of a checkpoint, or null.
+
+    What else it takes from other runs is the path of a checkpoint from then on too, so that all
+    GMIs, restarts and resumed runs take the same.
+
+    Raises:
+      ConfigError: there is no such checkpoint.
+    """
+    resume = None if checkpoint is None else str(checkpoint)
+    run = dataclasses.replace(config.run, resume=resume)
+    return dataclasses.replace(config, run=run, algo=config.algo.with_checkpoints(find_checkpoint))
+
+
+def record_end(
+    config: TrainConfig,
+    plan: Plan,
+    run: RunPaths,
+    status: str,
+    wall_s: float,
+    restarts: Sequence[Mapping[str, Any]],
+) -> None:
+    """Leaves in the run folder how a run has ended; arguments as of `train_summary`."""
+    add_event(run.events, status)
+    drop_unfinished(run)  # On a full disk they stand in the way of the summary.
+    write_json(run.summary, train_summary(config, plan, run, status, wall_s, restarts))
+    with suppress(OSError):  # What counts is written.
+        draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
+
+
+def what_is_left(run: RunPaths) -> str:
+    """Says how an interrupted job can be continued."""
+    if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
+        return f"training was complete: {nearby(run.root)}"
+    if checkpoints_of(run.root):
+        return f"continue: gmijax train run.dir={shlex.quote(nearby(run.root))} run.resume=auto"
+    if not read_metrics(run.metrics):
+        return "training had not begun, so there is no checkpoint"
+    return "there is no checkpoint: run.stop_timeout_s is the time that GMIs get to save one"
