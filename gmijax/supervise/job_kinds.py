@@ -120,6 +120,11 @@ def training_plan(
         num_nodes = len(nodes)
         wishes = on_fewer_nodes(wishes, config.cluster.nodes, num_nodes)
     placed = place(wishes, num_nodes)
+    if config.algo.is_one_pair and placed.plan.layout != ((0, 1),):
+        raise ConfigError(
+            f"plan: {placed.reason}; with algo={config.algo.name} one GMI acts and one trains, on "
+            "one GPU (plan.serving_gmis_per_gpu=1), or all do both (null)"
+        )
     plan = make_plan(
         placed.plan,
         config.reduce,
