@@ -78,13 +78,13 @@ class TrainConfig(KeyGroup):
         return self.num_envs
 
     def _check_one_pair(self) -> None:
-        what = f"with algo={self.algo.name} and agents apart"
+        what = f"where algo={self.algo.name} acts in a GMI of its own"
         if self.num_envs == "auto":
-            raise ConfigError(f"num_envs=auto: {what} nothing is searched for; give a number")
+            raise ConfigError(f"num_envs=auto: nothing is searched for {what}; give a number")
         if self.cluster.engine is not None:
             raise ConfigError(
-                f"cluster.engine={self.cluster.engine}: {what} a job is on one machine; allowed "
-                "is null"
+                f"cluster.engine={self.cluster.engine}: {what}, the job is on one machine; "
+                "allowed is null"
             )
 
     def _check_on_nodes(self) -> None:
