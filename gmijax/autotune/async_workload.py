@@ -55,7 +55,7 @@ class A3cWorkload(Workload[TrainConfig]):
         self.plan = dataclasses.replace(
             given,
             gpus=indices or len({*serving, *training}),
-            gmis_per_gpu=AUTO if is_auto else given.serving_gmis_per_gpu,
+            gmis_per_gpu=AUTO if is_auto else given.num_serving_gmis,
             serving_gpus=None,
             training_gpus=None,
             serving_gmis_per_gpu=1,
@@ -186,7 +186,7 @@ def _without_auto(plan: PlanConfig) -> PlanConfig:
     """The plan as if nothing were `auto` in it; raises ConfigError for a number that is given."""
     if plan.gmis_per_gpu != AUTO:
         return plan
-    if (value := plan.serving_gmis_per_gpu) != 1:
+    if (value := plan.num_serving_gmis) != 1:
         raise ConfigError(
             f"plan.serving_gmis_per_gpu={value}: is searched for with plan.gmis_per_gpu=auto; "
             f"give search.gmis_per_gpu=[{value}], or plan.gmis_per_gpu=1 to have it as it is"

@@ -14,6 +14,7 @@ from gmijax.errors import ConfigError
 class A3cConfig(ActorCriticConfig):
     """Hyper-parameters of asynchronous actor-critic training, with Brax's names."""
 
+    decoupled = "gmijax.a3c.decoupled:A3C"
     templates = ("decoupled",)
 
     # algo= sets it.

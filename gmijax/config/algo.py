@@ -49,6 +49,11 @@ class PolicyConfig(KeyGroup):
     implementation: ClassVar[str] = ""
     """`module:name` of the `gmijax.learning.algorithm.Algorithm`, where every GMI simulates, acts
     and trains; jax is imported with it."""
+    decoupled: ClassVar[str] = ""
+    """The same of the `gmijax.decoupled.algorithm.DecoupledAlgorithm`, where agents and trainers
+    are different GMIs."""
+    is_one_pair: ClassVar[bool] = False
+    """Whether there is only one of each then, on one GPU."""
     fixed_keys: ClassVar[tuple[str, ...]] = ("activation", "state_dependent_std")
     """What a resumed run cannot change, since its weights depend on it."""
     templates: ClassVar[tuple[Literal["tcg_ex", "tdg_ex", "decoupled"], ...]] = ("tcg_ex",)

@@ -76,7 +76,11 @@ class PlanConfig(KeyGroup):
         "the last quarter, at least one",
         default=None,
     )
-    serving_gmis_per_gpu: int = doc("with algo=a3c: acting GMIs on every GPU that acts", default=1)
+    serving_gmis_per_gpu: int | None = doc(
+        "with algo=a3c: acting GMIs on every GPU that acts, null: 1; with algo=sac: 1 to act in a "
+        "GMI of its own, null: agents and learner take turns in one program",
+        default=None,
+    )
     training_gmis_per_gpu: int = doc(
         "with algo=a3c: training GMIs on every GPU that trains", default=1
     )
@@ -92,12 +96,24 @@ class PlanConfig(KeyGroup):
             gpus = self.gpus if gpus is None else gpus
             num_gpus = gpus if isinstance(gpus, int) else len(gpus)
             key = f"{side}gmis_per_gpu"
-            gmis = getattr(self, key)
+            gmis = self.num_serving_gmis if side == "serving_" else getattr(self, key)
             if (num_gmis := num_gpus * (1 if gmis == "auto" else gmis)) > MAX_GMIS:
                 raise ConfigError(
                     f"plan.{key}={gmis}: makes {num_gmis} GMIs on {num_gpus} GPUs; at most "
                     f"{MAX_GMIS} are allowed"
                 )
+
+    @property
+    def num_serving_gmis(self) -> int:
+        """Acting GMIs on every GPU that acts, where some do."""
+        return 1 if self.serving_gmis_per_gpu is None else self.serving_gmis_per_gpu
+
+    @property
+    def asks_for_agents(self) -> bool:
+        """Whether some GMIs shall act and others train, where an algorithm leaves the choice."""
+        given = self.serving_gmis_per_gpu, self.serving_gpus, self.training_gpus
+        is_asked = self.template == "decoupled" or any(value is not None for value in given)
+        return self.template in ("auto", "decoupled") and is_asked
 
     @property
     def num_gpus(self) -> int:

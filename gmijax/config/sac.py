@@ -19,6 +19,9 @@ class SacConfig(PolicyConfig):
     """Hyper-parameters of SAC with many environments and large batches (arXiv:2512.01996)."""
 
     implementation = "gmijax.sac.sac:SAC"
+    decoupled = "gmijax.sac.decoupled:SAC"
+    is_one_pair = True
+    templates = ("tcg_ex", "decoupled")
     fixed_keys = (
         *PolicyConfig.fixed_keys,
         *("critic_hidden_layer_sizes", "num_atoms", "value_range"),
@@ -105,7 +108,10 @@ class SacConfig(PolicyConfig):
 
     def check_job(self, num_envs: int | None, template: str) -> None:
         """See `PolicyConfig`."""
-        for key, is_wrong, allowed in (*self._sizes(num_envs), *self._policy()):
+        checks = (*self._sizes(num_envs), *self._policy())
+        if template == "decoupled":
+            checks = (*checks, *self._apart())
+        for key, is_wrong, allowed in checks:
             if is_wrong:
                 value = getattr(self, key)
                 raise ConfigError(f"algo.{key}={value}: with algo=sac must be {allowed}")
@@ -136,6 +142,16 @@ class SacConfig(PolicyConfig):
             self.replay_precision != "float32" and not self.normalize_observations,
             "float32 where algo.normalize_observations=false",
         )
+
+    def _apart(self) -> Iterator[tuple[str, bool, str]]:
+        """The same where one GMI acts and another one learns."""
+        length = self.unroll_length
+        yield (
+            "replay_steps",
+            self.replay_steps % length > 0,
+            f"a multiple of algo.unroll_length={length} where a GMI of its own acts",
+        )
+        yield "save_replay", self.save_replay, "false where a GMI of its own acts"
 
     def _policy(self) -> Iterator[tuple[str, bool, str]]:
         """The same of the policy and of what it learns from."""

@@ -130,12 +130,13 @@ def _counts(plan: PlanConfig) -> tuple[int, int]:
             f"plan.gmis_per_gpu={plan.gmis_per_gpu}: with the decoupled template give "
             "plan.serving_gmis_per_gpu and plan.training_gmis_per_gpu"
         )
-    for key, what in (("serving_gmis_per_gpu", "act"), ("training_gmis_per_gpu", "train")):
-        if getattr(plan, key) < 1:
+    counts = plan.num_serving_gmis, plan.training_gmis_per_gpu
+    for key, what, count in zip(("serving", "training"), ("act", "train"), counts, strict=True):
+        if count < 1:
             raise ConfigError(
-                f"plan.{key}={getattr(plan, key)}: at least one GMI must {what}, so at least 1"
+                f"plan.{key}_gmis_per_gpu={count}: at least one GMI must {what}, so at least 1"
             )
-    return plan.serving_gmis_per_gpu, plan.training_gmis_per_gpu
+    return counts
 
 
 def serving_and_training(

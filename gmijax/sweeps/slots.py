@@ -70,7 +70,7 @@ def gmis_per_slot(config: TrainConfig) -> int:
     """How many GMIs a job has at each of its slots."""
     plan = config.plan
     if config.is_decoupled:
-        return plan.serving_gmis_per_gpu + plan.training_gmis_per_gpu
+        return plan.num_serving_gmis + plan.training_gmis_per_gpu
     return 1 if plan.gmis_per_gpu == "auto" else plan.gmis_per_gpu
 
 
