@@ -1,4 +1,4 @@
-"""Checkpoints of the full state: their parts, when they are complete, and which of them stay.
+"""Checkpoints of the full state: their parts, and when they are complete.
 
 `<run>/checkpoints/<12-digit env steps>/{learner,gmi_0,gmi_1,...,meta.json}`: what all GMIs share
 is written by the leader, each GMI's environments, and its replay if asked, by itself. Everything
@@ -27,8 +27,9 @@ from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, NonFiniteError, ParameterMismatch
 from gmijax.learning import saved_arrays
 from gmijax.learning.episode_window import Standing
+from gmijax.learning.kept_checkpoints import keep_best, keep_last_replays, remove
 from gmijax.runs.folder import META, RunPaths, read_json, replay_name, replays_of, write_json
-from gmijax.runs.resume import CheckpointMeta, checkpoints_of, file_check, rank_of
+from gmijax.runs.resume import CheckpointMeta, file_check
 from gmijax.types import PyTree
 
 T = TypeVar("T")
@@ -153,51 +154,14 @@ def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = 
     write_json(partial / META, meta.to_dict())
     _sync(partial)
     if final.exists():  # A broken one, which a restart has passed over; or one without replays.
-        _remove(paths, final)
+        remove(paths, final)
     os.replace(partial, final)
     _sync(final.parent)
     if keep is not None:
-        _remove_old(paths, keep, final)
+        keep_best(paths, keep, final)
     if replays_of(final):
-        _remove_old_replays(paths, final)
+        keep_last_replays(paths, final)
     return final
-
-
-def _remove_old_replays(paths: RunPaths, last: Path) -> None:
-    """Replays are kept in one checkpoint alone: they are many times as large as all else."""
-    for checkpoint in checkpoints_of(paths.root):
-        replays = replays_of(checkpoint)
-        if checkpoint == last or not replays:
-            continue
-        # First the list of files, so that it is a whole checkpoint at any time.
-        meta = CheckpointMeta.read(checkpoint)
-        names = {path.name for path in replays}
-        files = {
-            name: check for name, check in meta.files.items() if name.split("/")[0] not in names
-        }
-        write_json(checkpoint / META, dataclasses.replace(meta, files=files).to_dict())
-        for path in replays:
-            hidden = path.with_name(f".{path.name}")
-            os.replace(path, hidden)
-            shutil.rmtree(hidden, ignore_errors=True)
-
-
-def _remove_old(paths: RunPaths, keep: int, last: Path) -> None:
-    # Later ones, which a restart has passed over, are in nobody's place.
-    found = [path for path in checkpoints_of(paths.root) if path.name <= last.name]
-    best = max(reversed(found), key=rank_of)
-    others = [path for path in found if path != best]
-    num_others = max(keep - 1, int(best != last))
-    for path in others[: max(0, len(others) - num_others)]:
-        _remove(paths, path)
-
-
-def _remove(paths: RunPaths, checkpoint: Path) -> None:
-    # Under another name first: what has lost some of its files is no checkpoint.
-    hidden = paths.removed(int(checkpoint.name))
-    shutil.rmtree(hidden, ignore_errors=True)
-    os.replace(checkpoint, hidden)
-    shutil.rmtree(hidden, ignore_errors=True)
 
 
 def _sync(path: Path) -> None:

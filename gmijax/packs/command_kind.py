@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import os
 import shlex
@@ -14,7 +12,7 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from gmijax.clock import running_s
 from gmijax.config.pack import PackConfig
@@ -23,10 +21,9 @@ from gmijax.packs.event_files import EventReader
 from gmijax.packs.failure import failure_of
 from gmijax.packs.output import OutputReader
 from gmijax.packs.progress import ProgressReader, own_patterns
+from gmijax.packs.recorder import Recorder, mark_of
 from gmijax.packs.template import fill
 from gmijax.runs.folder import RunPaths, write_json
-from gmijax.runs.history import copy_history
-from gmijax.supervise.start_gmi import program_cache
 from gmijax.sweeps.children import ChildStatus, Process
 from gmijax.sweeps.kind import JobStart
 from gmijax.sweeps.paths import SweepPaths
@@ -136,8 +133,8 @@ class CommandKind:
             events = EventReader(run_dir, settings.tag, time.time(), running_s)
         progress = ProgressReader(output, self._own, running_s(), running_s, events)
         # On CPU cores alone nothing is compiled that others could use.
-        mark = _mark_of(job, self._names[slot.site]) if slot.devices else None
-        reader = _Recorder(progress, run.metrics, mark)
+        mark = mark_of(job, self._names[slot.site]) if slot.devices else None
+        reader = Recorder(progress, run.metrics, mark)
         return JobStart(process, (reader,), is_awaited=mark is not None and not mark.exists())
 
     def _variables(self, job: CommandJob, run_dir: Path, cores: int) -> dict[str, str]:
@@ -248,43 +245,6 @@ class CommandKind:
             "env_steps_per_s": progress.mean_steps_per_s,
         }
         write_json(run.summary, {**found, **more, "error": progress.error})
-
-
-class _Recorder:
-    """Keeps the lines of metrics of a command in its folder, as a training run does.
-
-    With the first one it makes the file `mark`, if any: what is compiled is in its caches then.
-    """
-
-    def __init__(self, reader: ProgressReader, metrics: Path, mark: Path | None) -> None:
-        self._reader, self._metrics, self._mark = reader, metrics, mark
-        self._is_first = True
-
-    def new(self) -> list[dict[str, Any]]:
-        lines = self._reader.new()
-        if not lines:
-            return lines
-        is_first, self._is_first = self._is_first, False
-        with suppress(OSError):  # A full disk must not end the pack.
-            if is_first and self._metrics.exists():
-                # An attempt that goes on from a checkpoint repeats some steps, or counts anew.
-                copy_history(self._metrics, self._metrics, lines[0]["env_steps"] - 1)
-            with self._metrics.open("a") as file:
-                file.writelines(json.dumps(line) + "\n" for line in lines)
-            if is_first and self._mark is not None:
-                self._mark.parent.mkdir(parents=True, exist_ok=True)
-                self._mark.touch()
-        return lines
-
-
-def _mark_of(job: CommandJob, machine: str | None) -> Path:
-    """The file that is there once such a job has reported anything on a machine.
-
-    It goes when the compilation cache is emptied. One that is wrong costs time: jobs then compile
-    the same at the same time.
-    """
-    key = hashlib.sha256(f"{machine} {job.program}".encode()).hexdigest()
-    return program_cache() / f"gmijax-job-{key}"
 
 
 @dataclass

@@ -38,11 +38,9 @@ class CPhysics:
         if missing := carried.needed(mj_model):
             raise NotImplementedError(f"MuJoCo in C: {missing[0]} is not carried")
         self.mj_model = copy.copy(mj_model)
-        # MuJoCo would start an environment anew by itself that diverges; see
-        # `gmijax.sim.divergence`.
+        # MuJoCo would restart a diverged environment by itself; see `gmijax.sim.divergence`.
         self.mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        # An environment that diverges ends; MuJoCo would also add a line to a file where the user
-        # stands.
+        # A diverged environment ends; MuJoCo would also add a line to a file in the user's folder.
         mujoco.set_mju_user_warning(lambda message: None)
         self.data = mujoco.MjData(self.mj_model)
         self.substeps = substeps

@@ -94,9 +94,8 @@ class Env(NamedTuple):
         tree with 0 at the leaves that have a leading axis [N] (see `gmijax.sim.randomize`).
       next_episode: `(model, ended EnvState) -> EnvState`, the episode that follows one of the same
         environment, for tasks that carry something on in `task`, such as the level of a
-        curriculum.
-        None: `reset(model, ended.key)`. Of an environment that diverged `task` is that of one step
-        earlier.
+        curriculum. None: `reset(model, ended.key)`. Of an environment that diverged `task` is
+        that of one step earlier.
       draw_models: `keys [N] -> model`, domain randomisation that the task brings itself: all
         leaves have an axis [N]. None if it brings none.
       command: `EnvState -> [3]`, the velocity that a robot is commanded, for films: m/s forwards

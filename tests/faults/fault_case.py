@@ -153,7 +153,7 @@ class FaultyCommand:
                 "it goes on",
                 _LOOK_S,
             )
-            send([Process(job.pid, "controller", "", None)], signal.SIGTERM)
+            send([Process(job.pid, "controller")], signal.SIGTERM)
         code = self._wait(job)
         if code != (130 if self._about.is_endless else 0):
             self.wrong.append(f"it must go on, but exit code {code}: {self.said()[-600:]}")

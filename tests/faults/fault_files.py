@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -210,9 +209,3 @@ def drawn_file(folder: Path, kind: EditKind, draw: random.Random) -> Path:
     """The file that is damaged."""
     found = sorted(path for path in folder.glob(kind.files) if path.is_file())
     return draw.choice([path for path in found if not path.name.startswith(".")])
-
-
-def copy_of(source: Path, target: Path) -> Path:
-    """A copy of a fixture, with its times."""
-    shutil.copytree(source, target)
-    return target

@@ -1,4 +1,4 @@
-"""The processes of a command: which is which, how far they are, and what can be done to them."""
+"""The processes of a command: which is which, and what can be done to them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
-
-from gmijax.supervise.heartbeat import STATES, Heartbeat, HeartbeatBlock
 
 MARKER = "GMIJAX_FAULTS"
 """Names the folder of a case in the environment of all its processes."""
@@ -35,29 +33,10 @@ class Process(NamedTuple):
     Attributes:
       pid: its number.
       role: `controller`, `job` (the controller of a job of a sweep), `janitor`, `gmi_<id>`, ...
-      folder: of the run that it is a GMI of.
-      heartbeat_fd: its memory of heartbeats.
     """
 
     pid: int
     role: str
-    folder: str
-    heartbeat_fd: int | None
-
-    def beat(self) -> Heartbeat | None:
-        """What a GMI last said of itself."""
-        if self.heartbeat_fd is None:
-            return None
-        try:
-            with open(f"/proc/{self.pid}/fd/{self.heartbeat_fd}", "r+b") as memory:
-                return HeartbeatBlock(memory.fileno()).read()
-        except (OSError, ValueError):
-            return None
-
-    def has_reached(self, state: str) -> bool:
-        """Whether a GMI is that far in its life, or farther."""
-        beat = self.beat()
-        return beat is not None and STATES.index(beat.state) >= STATES.index(state)
 
 
 def processes_of(scratch: Path, controller: int | None = None) -> list[Process]:
@@ -78,12 +57,11 @@ def processes_of(scratch: Path, controller: int | None = None) -> list[Process]:
 
 def _process(pid: int, words: str, known: dict[str, str], controller: int | None) -> Process:
     role = next((role for module, role in _ROLES.items() if module in words), "other")
-    fd = known.get("GMIJAX_HEARTBEAT_FD")
     if pid == controller:
         role = "controller"
     elif role == "other" and "GMIJAX_GMI" in known:
         role = f"gmi_{known['GMIJAX_GMI']}"
-    return Process(pid, role, known.get("GMIJAX_RUN_DIR", ""), None if fd is None else int(fd))
+    return Process(pid, role)
 
 
 def gmis_of(processes: Sequence[Process]) -> list[Process]:

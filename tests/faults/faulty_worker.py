@@ -180,7 +180,7 @@ def _inject_in_training(faults: Faults) -> None:
 
     from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
     from gmijax.collectives.program import ProgramStep
-    from gmijax.learning import checkpoint, saved_arrays
+    from gmijax.learning import checkpoint, kept_checkpoints, saved_arrays
     from gmijax.learning.throughput import ThroughputMeter
     from gmijax.learning.training_log import TrainingLog
 
@@ -217,7 +217,7 @@ def _inject_in_training(faults: Faults) -> None:
     _before(ThroughputMeter, "measure", lambda *_: faults.at("measuring"))
     _before(checkpoint, "_sync", synced)
     saved_arrays.save = save_half
-    checkpoint.shutil = _Recorded(checkpoint.shutil, removed)
+    kept_checkpoints.shutil = _Recorded(kept_checkpoints.shutil, removed)
     ProgramStep.__call__ = iterate_poisoned
 
 
