@@ -11,7 +11,7 @@ import numpy as np
 
 from gmijax.config import AlgoConfig, EnvConfig
 from gmijax.config.schema import to_dict
-from gmijax.learning.learner import TrainState, acting_moments
+from gmijax.learning.learner import LearnerState, acting_moments
 from gmijax.learning.normalize import OBS_CLIP, std_of
 from gmijax.player.policy import PlainPolicy, write_policy
 from gmijax.runs.folder import POLICY, RunPaths
@@ -19,7 +19,7 @@ from gmijax.version import __version__
 
 
 def save_policy(
-    paths: RunPaths, env_steps: int, env: EnvConfig, algo: AlgoConfig, state: TrainState
+    paths: RunPaths, env_steps: int, env: EnvConfig, algo: AlgoConfig, state: LearnerState
 ) -> None:
     """Writes it beside the learner's state, as `save_learner` does that.
 
@@ -29,7 +29,9 @@ def save_policy(
     write_policy(path, plain_policy(env, algo, state, env_steps=env_steps))
 
 
-def plain_policy(env: EnvConfig, algo: AlgoConfig, state: TrainState, **about: Any) -> PlainPolicy:
+def plain_policy(
+    env: EnvConfig, algo: AlgoConfig, state: LearnerState, **about: Any
+) -> PlainPolicy:
     """The policy to act with when the learner has `state`; `about` is noted in it."""
     layers = state.params.policy["params"]
     num_norms = sum(name.startswith("LayerNorm_") for name in layers)

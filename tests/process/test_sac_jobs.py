@@ -127,8 +127,14 @@ def test_a_job_goes_on_after_one_of_the_two_is_killed(tmp_path: Path, victim: in
     _wait_for_lines(job, run, 0)
     wait_until(lambda: list(run.glob("checkpoints/[0-9]*")), 60, "a checkpoint")
     kill(gmi_pid(run, victim) or 0)
-    wait_until(lambda: (run / "attempt_1").exists(), 60, "the first attempt to be over")
-    saved = int(find_checkpoint(str(run), "test").name)
+    events = run / "events.jsonl"
+    wait_until(lambda: '"recovered"' in events.read_text(), 90, "the job to go on")
+    [again] = [
+        event
+        for event in map(json.loads, events.read_text().splitlines())
+        if event["event"] == "start" and event["attempt"] == 1
+    ]
+    saved = int(Path(again["checkpoint"]).name)
     _wait_for_lines(job, run, saved + UNROLL)
     job.send_signal(signal.SIGINT)
     assert job.wait(timeout=90) == 130
