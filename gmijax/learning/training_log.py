@@ -199,7 +199,7 @@ class TrainingLog:
             sink.close()
 
 
-def _counted(counts: Any, simulated: int) -> Line:
+def _counted(counts: Any, simulated: float) -> Line:
     return {
         "diverged_steps": counts.diverged["any"],
         **overflow_line(counts.overflowed),
