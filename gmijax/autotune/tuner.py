@@ -198,6 +198,7 @@ class Search:
         limit_s = min(left_s, self._settings.profile_limit_s)
         if self.run is None:
             self.run = create_run(None, None, f"{self._workload.config.env.slug}-search")
+        self._display.begin()
         try:
             return profile(
                 self._workload,

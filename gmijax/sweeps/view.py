@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -11,6 +12,7 @@ from rich.text import Text
 
 from gmijax.config.sweep import Ranking
 from gmijax.control.display import LiveDisplay, bar, clock
+from gmijax.control.time_left import TimeLeft
 from gmijax.sweeps.kind import AnyJob, label_of, trainings_per_hour
 from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import shown
@@ -34,6 +36,7 @@ class SweepView:
     def __init__(self, console: Console, jobs: Sequence[AnyJob], ranking: Ranking) -> None:
         self._console, self._jobs, self._ranking = console, jobs, ranking
         self._states: dict[int, tuple[str, int]] = {}
+        self._left: defaultdict[int, TimeLeft] = defaultdict(TimeLeft)
         self._display = LiveDisplay(console)
 
     def __enter__(self) -> Self:
@@ -60,6 +63,9 @@ class SweepView:
         return "; ".join(filter(None, (counts, ", ".join(parts))))
 
     def _show(self) -> Group | None:
+        for job in self._jobs:
+            if job.progress.state == "running" and job.progress.env_steps:
+                self._left[job.number].note(job.progress.env_steps)
         self._print_changes()
         return Group(self._table(), Text(self.line())) if self._display.has_panel else None
 
@@ -98,7 +104,8 @@ class SweepView:
         names = _short_names(self._jobs)
         for job in rows[:_MOST_ROWS]:
             label = label_of({names[key]: value for key, value in job.overrides.items()})
-            table.add_row(*_row(job, job.progress, label, has_slots=has_slots))
+            left_s = self._left[job.number].seconds(job.num_timesteps or 0)
+            table.add_row(*_row(job, job.progress, label, left_s, has_slots=has_slots))
         if len(rows) > _MOST_ROWS:
             table.add_row("", f"and {len(rows) - _MOST_ROWS} more")
         return table
@@ -118,15 +125,15 @@ def _short_names(jobs: Sequence[AnyJob]) -> dict[str, str]:
 
 
 def _row(
-    job: AnyJob, progress: Progress, label: str, *, has_slots: bool
+    job: AnyJob, progress: Progress, label: str, left_s: float | None, *, has_slots: bool
 ) -> tuple[str | Text, ...]:
     total, rate = job.num_timesteps, progress.env_steps_per_s
     part = min(progress.env_steps / total, 1.0) if total else None
-    left_s = max(0.0, total - progress.env_steps) / rate if rate and total else None
     done = f" {progress.env_steps:,}" if part is None else f" {part:.0%}"
     words = filter(None, (progress.error, progress.note))
-    is_silent = progress.state == "running" and total and not progress.env_steps
-    state = "starting" if is_silent else progress.state
+    is_running = progress.state == "running"
+    is_silent = is_running and total and progress.updated_s is None
+    state = f"starting {clock(progress.wall_s)}" if is_silent else progress.state
     return (
         str(job.number),
         # As text: overrides and errors may look like markup.
@@ -136,6 +143,6 @@ def _row(
         f"{rate:,.0f}" if rate else "",
         "" if progress.latest is None else f"{progress.latest:.4g}",
         _ranked(progress),
-        "" if left_s is None else clock(left_s),
+        clock(left_s) if is_running and left_s is not None else "",
         Text(": ".join((state, *words))),
     )

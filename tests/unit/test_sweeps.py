@@ -177,6 +177,15 @@ def test_returns_of_different_rewards_are_warned_of(
         assert said.startswith(f"warning: sweep.objective={objective}: jobs differ in env.rewards")
 
 
+def test_a_sweep_says_that_its_jobs_compile_first_unless_all_have_run() -> None:
+    work = build_sweep(("seed=0,1",))
+    (line,) = work.warnings(())
+    assert line.startswith("the first job of each task and size compiles its programs, ")
+    for job in work.jobs:
+        job.progress.state = "completed"
+    assert not work.warnings(())
+
+
 def gpu_slots(gpus: int, jobs_per_gpu: int) -> SlotPool:
     here = machine(gpus, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
     plan = plan_slots(SweepConfig(jobs_per_gpu=jobs_per_gpu), here, {"auto"})
@@ -500,6 +509,7 @@ def test_jobs_at_a_time_by_profiling(
     profiled: list[int],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     done: list[int] = []
@@ -514,10 +524,11 @@ def test_jobs_at_a_time_by_profiling(
     hosts = [LocalHost(machine(1, mps_control=Path("/usr/bin/nvidia-cuda-mps-control")))]
     for _ in range(2):  # The second time by the store.
         found = with_jobs_per_gpu(
-            SweepConfig(), jobs, hosts, open_console(show=False), StopSignals()
+            SweepConfig(), jobs, hosts, open_console(show=True), StopSignals()
         )
         assert found.jobs_per_gpu == best
     assert done == profiled
+    assert capsys.readouterr().out.count("they compile first") == len(profiled)
     done.clear()  # Larger jobs are others.
     large = jobs_of([compose(f"seed={n}", "plan.gmis_per_gpu=2") for n in range(num_jobs)])
     with_jobs_per_gpu(SweepConfig(), large, hosts, open_console(show=False), StopSignals())
