@@ -26,7 +26,14 @@ from gmijax.config import (
     ViewConfig,
 )
 from gmijax.config.schema import to_dict
-from gmijax.control.console import Show, doing, nearby, open_console, print_next
+from gmijax.control.console import (
+    Show,
+    doing,
+    nearby,
+    open_console,
+    print_next,
+    training_of,
+)
 from gmijax.control.progress import ConsoleProgress
 from gmijax.control.summary import EXPLORING
 from gmijax.deploy import shipped
@@ -173,7 +180,7 @@ def _next_steps(config: PlayConfig, label: str) -> tuple[tuple[str, str], ...]:
         task = config.run.env
         return (
             ("watch it in the browser", f"gmijax view env={task} checkpoint={SHIPPED}"),
-            ("train it yourself", f"gmijax train env={task}"),
+            training_of(str(task), has_gpu=bool(detect_machine().gpus)),
         )
     folder = shlex.quote(nearby(Path(str(config.run.dir))))
     view = ("watch it in the browser", f"gmijax view run.dir={folder}")

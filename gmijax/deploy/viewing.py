@@ -41,11 +41,11 @@ def view(config: ViewConfig, *, show: bool = False) -> None:
     Raises:
       ConfigError: bad input, e.g. no such checkpoint, or a package that is not installed.
     """
-    require_packages()
     console = open_console(show=show)
     shown = _shipped(config) if config.checkpoint == SHIPPED else _of_run(config, console)
     envs = [PlainEnv(shown.env, seed=config.seed + number) for number in range(config.num_envs)]
     _require_fit(shown.policy, envs[0])
+    require_packages()
     simulation = Simulation(envs, shown.policy, config.seed)
     _serve(config, simulation, shown, console)
 
@@ -88,6 +88,7 @@ def opened_once_saved(
                 return open_run(config)
             except NoCheckpointYet as error:
                 if not is_waiting:
+                    require_packages()  # Rather now than after the wait.
                     waiting.enter_context(doing(console, f"waiting: {error}"))
                 is_waiting = True
             time.sleep(_POLL_S)

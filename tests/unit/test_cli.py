@@ -36,6 +36,11 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "algo=td3", "algo=td3: unknown: allowed are a3c, distill, ppo, sac"),
     ("train", "num_env=3", "unknown key num_env: did you mean num_envs?"),
     ("train", "algo.gamma=0.9", "unknown key algo.gamma: did you mean algo.discounting?"),
+    ("train", "algo.rate=1", "unknown key algo.rate: did you mean algo.learning_rate?"),
+    ("train", "run.checkpoint_interval=9", "_interval: did you mean run.checkpoint_every?"),
+    ("train", "hidden_sizes=[8]", "_sizes: did you mean algo.policy_hidden_layer_sizes?"),
+    ("train", "algo.num_layers=2", "_layers: did you mean algo.policy_hidden_layer_sizes?"),
+    ("train", "algo.zzz=2", "unknown key algo.zzz: see --help all"),
     ("train", "lr=1", "unknown key lr: did you mean algo.learning_rate?"),
     ("train", "total_timesteps=1", "unknown key total_timesteps: did you mean num_timesteps?"),
     (

@@ -30,6 +30,7 @@ def test_it_waits_for_the_first_checkpoint_of_a_training(
         if len(polls) == 2:
             save(run, 100)
 
+    monkeypatch.setattr(viewing, "missing", tuple)
     monkeypatch.setattr(viewing.time, "sleep", sleep)
     with locked(run.lock, "x"):
         config, env, changed = viewing.opened_once_saved(
