@@ -64,7 +64,7 @@ def _usage() -> str:
             "       gmijax help [COMMAND]",
             "       gmijax --version\n",
             *lines,
-            "\nEvery command has its own --help. -v also prints the reasons for automatic choices.",
+            "\nEvery command has its own --help. -v also prints why it decided what it did.",
             "Completion of commands, keys and values in bash:",
             '  eval "$(gmijax -sc install=bash)"',
             "\nStart with:\n  gmijax demo\n",

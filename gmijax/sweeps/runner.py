@@ -109,15 +109,15 @@ def _run(
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
     job_events.end(report.data)
-    print_outcome(console, report.data, work.ranking, paths, view.line())
+    print_outcome(console, report.data, work.ranking, paths, view.line(), work.hint(report.data))
     if failed:
         first = failed[0]
         text = f"{len(failed)} of {len(jobs)} jobs failed; job {first.number}: "
         wrong = f"{text}{first.progress.error}{'' if wrong is None else f'; {wrong}'}"
     if wrong is not None:
         raise SweepFailed(wrong)
-    if report.data["ranking"]:
-        print_next(console, work.next_step(paths, report.data["ranking"][0]))
+    if ranking := report.data["ranking"]:
+        print_next(console, work.next_step(paths, ranking[0]))
     return SweepResult(paths.root, report.data)
 
 

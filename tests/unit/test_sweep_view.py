@@ -75,7 +75,7 @@ def test_the_table_says_of_each_job_where_and_how_far_it_is() -> None:
         view.update()
         shown = terminal.getvalue()
     rows = rows_of(shown)
-    assert "overrides GPU and slot progress steps/s return ranked by ETA state" in rows["job"]
+    assert rows["job"] == "job overrides GPU and slot progress steps/s return ranked by state"
     assert rows["0"].endswith("50% 50 2.5 3.5 running")
     assert "seed=0 GPU 3 slot 0" in rows["0"]
     assert rows["1"].endswith("25% 50 2.5 3.5 running")

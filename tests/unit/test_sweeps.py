@@ -435,6 +435,14 @@ def test_the_ranking_has_full_windows_first_and_jobs_without_a_value_below(
     assert [job["window_full"] for job in report["jobs"][:3]] == [True, False, True]
 
 
+def test_without_anything_to_rank_by_there_is_one_table_of_what_is_known(tmp_path: Path) -> None:
+    jobs = ended(("algo.entropy_cost=1,2", "seed=0,1"), [(None, 0, False)] * 4)
+    for job in jobs:
+        job.progress.env_steps, job.progress.earlier_s = 0, 61.0
+    [rows] = shown_tables(tmp_path, jobs, SweepConfig(objective="return"))
+    assert rows[0] == ["0", "algo.entropy_cost=1 seed=0", "1:01", "completed"]
+
+
 def test_settings_come_first_with_the_interquartile_mean_of_their_seeds(tmp_path: Path) -> None:
     values = (10.0, 11.0, 12.0, 90.0), (20.0, 21.0, 22.0, 23.0), (50.0, 50.0, None, 50.0)
     windows = [(v, 200, own != values[2] or seed) for own in values for seed, v in enumerate(own)]
