@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 import math
@@ -256,8 +257,18 @@ def _no_checkpoint(folder: Path) -> str:
 def _named(wanted: str, key: str) -> Path:
     folder = last_run(key) if wanted == "last" else Path(wanted)
     if not os.path.isdir(folder):  # Unlike `Path.is_dir` it takes any text.
-        raise ConfigError(f"{key}={wanted}: no such folder")
+        raise ConfigError(f"{key}={wanted}: no such folder{_near_folder(folder)}")
     return folder
+
+
+def _near_folder(folder: Path) -> str:
+    """`; did you mean ...` for a name that is close to that of a folder beside it."""
+    try:
+        names = [path.name for path in _folders_in(folder.parent)]
+    except (OSError, ValueError):  # Not to be read, or no name that a folder can have.
+        return ""
+    close = difflib.get_close_matches(folder.name, names, n=1)
+    return f"; did you mean {folder.parent / close[0]}?" if close else ""
 
 
 def last_run(key: str) -> Path:

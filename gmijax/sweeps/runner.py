@@ -103,7 +103,7 @@ def _run(
         job_events.end(report.data)
         if isinstance(error, JobInterrupted | SweepFailed):
             error.add_note(
-                f"the same command with run.dir={shlex.quote(nearby(paths.root))} goes on"
+                f"continue: the same command with run.dir={shlex.quote(nearby(paths.root))}"
             )
         raise
     failed = [job for job in jobs if job.progress.state == "failed"]

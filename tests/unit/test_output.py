@@ -369,7 +369,7 @@ def test_an_evaluation_says_whether_it_was_with_noise(
 @pytest.mark.parametrize(
     ("iterations", "error", "line"),
     [
-        ((20, 25), None, "profile of the iterations 20 to 25: profile"),
+        ((20, 25), None, "profile of iterations 20 to 25: profile/a/perfetto_trace.json.gz"),
         (None, None, "profile: none, the command ended before the first iteration of run.profile"),
         ((20, 22), "disk full", "profile: the trace could not be written: disk full"),
     ],
@@ -383,6 +383,8 @@ def test_a_run_says_what_became_of_its_profile(
 ):
     monkeypatch.chdir(tmp_path)
     run = RunPaths(tmp_path)
+    (run.profile / "a").mkdir(parents=True)
+    (run.profile / "a" / "perfetto_trace.json.gz").touch()
     profile = {"iterations": iterations, "dir": str(run.profile), "error": error}
     assert line in train_outcome({**SUMMARY, "profile": profile}, run).splitlines()
 

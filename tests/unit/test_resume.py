@@ -246,3 +246,10 @@ def test_a_leaf_that_the_run_did_not_randomize_stays_as_it_is(run: RunPaths):
     config = compose(f"run.resume={run.root}", "env.randomization.body_mass.range=[0.5,1.5]")
     assert set(config.env.randomization) == set(saved["env"]["randomization"])
     assert config.env.randomization["body_mass"].range == (0.5, 1.5)
+
+
+def test_a_misspelt_run_folder_is_answered_with_the_one_beside_it(tmp_path: Path):
+    make_run(tmp_path / "tiny", 100)
+    for name, said in (("tinny", r"no such folder; did you mean .*tiny\?$"), ("x" * 9, "folder$")):
+        with pytest.raises(ConfigError, match=said):
+            find_checkpoint(str(tmp_path / name), "run.dir")

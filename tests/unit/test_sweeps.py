@@ -87,7 +87,7 @@ def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
         (("sweep.gpus=[]",), "expected a number of GPUs or distinct indices"),
         (("seed=0,1", "algo.learnin_rate=1"), "unknown key algo.learnin_rate"),
         (("seed=0,x",), "seed"),
-        (("env=ant,nobody",), "env=nobody: unknown"),
+        (("env=ant,nobody",), "env=nobody: unknown task"),
         (("sweep.sampler=tpe", "seed=0,1"), "needs sweep.trials"),
         (("sweep.trials=3", "seed=0,1"), "sweep.sampler=grid runs all of them"),
         (("sweep.pruner=asha", "seed=0,1"), "not with sweep.sampler=grid"),
