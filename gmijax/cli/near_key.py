@@ -43,8 +43,8 @@ def near_key(key: str, known: Collection[str]) -> str:
     if close := difflib.get_close_matches(name, sorted(names), n=1, cutoff=0.75):
         so_called = sorted(one for one in known if one.rpartition(".")[2] == close[0])
         return f": did you mean {difflib.get_close_matches(key, so_called, n=1, cutoff=0.0)[0]}?"
-    groups = {one.partition(".")[0] for one in known} & {"env", "algo"}
-    if key not in groups and (group := difflib.get_close_matches(key, groups, 1, _OF_GROUPS)):
+    groups = {one.partition(".")[0] for one in known} & {"env", "algo"} - {key}
+    if name == key and (group := difflib.get_close_matches(key, groups, 1, _OF_GROUPS)):
         return f": did you mean {group[0]}?"  # It chooses a task or an algorithm.
     if near := _by_words(key, known):
         return f": did you mean {near}?"
