@@ -172,7 +172,7 @@ def _return_while_training(config: PlayConfig, returns: Mapping[str, Any]) -> st
     at_it = [line.get("return") for line in lines if line["env_steps"] == returns["env_steps"]]
     if not at_it or at_it[-1] is None or not returns["deterministic"]:
         return None
-    return f"while training: {at_it[-1]:.2f} {EXPLORING}"
+    return f"return during training: {at_it[-1]:.2f} {EXPLORING}"
 
 
 def _next_steps(config: PlayConfig, label: str) -> tuple[tuple[str, str], ...]:
