@@ -66,6 +66,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "ant", "ant: expected key=value; did you mean env=ant?"),
     ("train", "humanod", "humanod: expected key=value; did you mean env=humanoid?"),
     ("train", "a3c", "a3c: expected key=value; did you mean algo=a3c?"),
+    ("train", "hepl", "hepl: expected key=value; did you mean --help?"),
     ("train", "mine.py:make", "did you mean env=mine.py:make?"),
     ("play", "last", "last: expected key=value; did you mean run.dir=last?"),
     ("train", "nothing-like-it", "nothing-like-it: expected key=value\n"),
