@@ -306,7 +306,7 @@ def first_checkpoint_of(folder: Path) -> str:
     with suppress(ConfigError, LookupError, TypeError):
         every = read_json(RunPaths(folder).config)["run"]["checkpoint_every"]
     when = f"after {every} iterations (run.checkpoint_every)" if every else "when it ends"
-    return f"still training, without a checkpoint; it saves the first one {when}"
+    return f"still training, no checkpoint yet; the first is saved {when}"
 
 
 def _written_s(checkpoint: Path) -> tuple[float, float]:

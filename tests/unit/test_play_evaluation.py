@@ -131,7 +131,7 @@ def test_the_last_run_is_not_mistaken_for_one_that_is_training(
         write_json(paths.config, to_dict(compose("env=ant")))
     monkeypatch.chdir(run.root.parents[1])
     with locked(new.lock, "new"):
-        assert "runs/new: still training, without a checkpoint" in str(
+        assert "runs/new: still training, no checkpoint yet" in str(
             playing.open_run(config_of())[2]
         )
         assert playing.open_run(config_of(f"run.dir={run.root}"))[2] is None

@@ -55,7 +55,7 @@ def test_a_run_that_trains_has_its_first_checkpoint_still_to_come(
     run = make_run(Path("runs") / "new")
     config = read_json(run.config)
     write_json(run.config, {**config, "run": {**config["run"], "checkpoint_every": every}})
-    later = f"still training, without a checkpoint; it saves the first one {when}"
+    later = f"still training, no checkpoint yet; the first is saved {when}"
     with locked(run.lock, "new"):
         for named, said in (("last", "run.dir=last: runs/new: "), ("runs/new", "=runs/new: ")):
             with pytest.raises(NoCheckpointYet, match=re.escape(f"{said}{later}")):

@@ -39,6 +39,6 @@ def test_it_waits_for_the_first_checkpoint_of_a_training(
     assert (Path(str(config.checkpoint)).name, env.label, changed) == ("000000000100", "ant", None)
     assert len(polls) == 2
     assert capsys.readouterr().out == (
-        "waiting: run.dir=last: runs/x: still training, without a checkpoint; it saves the first "
-        "one after 7 iterations (run.checkpoint_every)\n"
+        "waiting: run.dir=last: runs/x: still training, no checkpoint yet; the first is saved "
+        "after 7 iterations (run.checkpoint_every)\n"
     )
