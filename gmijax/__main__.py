@@ -13,16 +13,16 @@ from gmijax.version import __version__
 VERBS: Final[Mapping[str, str]] = MappingProxyType(
     {
         "train": "trains a policy, in one process or in several",
-        "play": "evaluates a checkpoint, and films it",
-        "view": "shows a policy live in the browser, also while it is trained",
+        "play": "evaluates a checkpoint and films it",
+        "view": "shows a policy live in the browser, also during training",
         "serve": "collects experience with a trained policy or random actions",
-        "search": "finds the fastest number of environments and of processes on a GPU",
+        "search": "finds the number of environments and of processes that is fastest on a GPU",
         "sweep": "runs many training jobs, several at a time on every GPU",
         "pack": "runs any training command, several at a time on every GPU",
         "export": "writes a policy as files for robots: ONNX, StableHLO",
-        "doctor": "says what this machine can do for gmijax, what it cannot, and why",
+        "doctor": "checks what works on this machine, and says how to fix what does not",
         "list-envs": "lists the tasks",
-        "demo": "plays and films a trained policy, within seconds",
+        "demo": "plays and films a trained policy within seconds",
     }
 )
 """Command -> what it does. `main(argv)` of the module of that name runs it, `-` read as `_`."""
@@ -43,11 +43,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb in ("-sc", "--shell-completion"):
         from gmijax.cli.completion import complete
 
-        return complete(rest, VERBS)
+        return complete(rest, (*VERBS, "help"))
     if verb not in VERBS:
         from gmijax.config.schema import suggestion
 
-        sys.stderr.write(f"gmijax: unknown command {verb!r}{suggestion(verb, VERBS)}\n")
+        sys.stderr.write(f"gmijax: unknown command {verb!r}{suggestion(verb, (*VERBS, 'help'))}\n")
         return 2
     try:
         return importlib.import_module(f"gmijax.{verb.replace('-', '_')}").main(rest)
@@ -61,6 +61,7 @@ def _usage() -> str:
     return "\n".join(
         (
             "usage: gmijax COMMAND [key=value ...] [--help]",
+            "       gmijax help [COMMAND]",
             "       gmijax --version\n",
             *lines,
             "\nEvery command has its own --help. -v also prints why it decided what it did.",

@@ -14,14 +14,16 @@ from rich.console import Console
 
 from gmijax.config import PlayConfig
 from gmijax.config.env import PhysicsConfig
-from gmijax.config.play import FILMED, PlayRunConfig
-from gmijax.control.console import nearby, open_console
+from gmijax.config.play import PlayRunConfig
+from gmijax.control.console import SMALL_TASK, nearby, open_console, print_next, training_of
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.deploy import shipped
 from gmijax.deploy.pictures import film
+from gmijax.deploy.shipped import SHIPPED
 from gmijax.machine.snapshot import detect_machine
 from gmijax.player.shipped import shipped_tasks
 from gmijax.runs.folder import RunPaths, read_json
+from gmijax.viewer.installed import missing
 
 USAGE: Final = """usage: gmijax demo [env=TASK] [key=value ...]
 
@@ -30,7 +32,7 @@ runs/shipped/TASK. Then it asks whether to train ball_balance here: about a minu
 on two CPU cores. If you add keys of `gmijax train`, it trains that task with them without asking.
 """
 
-TASK: Final = "ball_balance"
+TASK: Final = SMALL_TASK
 CPU_STEPS: Final = 300_000
 GPU_STEPS: Final = 3_000_000
 PLAY_S, FILM_S = 2.0, 7.0
@@ -63,9 +65,9 @@ def demo(overrides: Sequence[str]) -> None:
     if config is None and _is_wanted():
         config = _training((), TASK)
     if config is None:
-        console.print(f"train it yourself:\n  gmijax train env={task}")
+        print_next(console, *_next_steps(task))
     else:
-        _train(config)
+        _train(config, console)
 
 
 def show_shipped(task: str, console: Console) -> None:
@@ -85,11 +87,19 @@ def show_shipped(task: str, console: Console) -> None:
         film(config, paths, returns["camera"], console, FILM_S)
     finally:
         paths.model.unlink(missing_ok=True)
-    again = f"gmijax play env={task} checkpoint=shipped"
+
+
+def _next_steps(task: str) -> tuple[tuple[str, str], ...]:
+    """What to type after the film of a policy."""
+    watch = "watch whole episodes", f"gmijax view env={task} checkpoint={SHIPPED}"
+    if missing():
+        watch = "film whole episodes", f"gmijax play env={task} checkpoint={SHIPPED}"
+    train = training_of(task, has_gpu=bool(detect_machine().gpus))
     others = [name for name in shipped_tasks() if name != task]
-    console.print(f"all of the episodes: {again}")
-    if others:
-        console.print(f"other tasks: gmijax demo env=TASK, with {', '.join(others)}")
+    if not others:
+        return watch, train
+    other = f"see another task, of {', '.join(others)}", f"gmijax demo env={others[0]}"
+    return watch, other, train
 
 
 def play_config(task: str) -> PlayConfig:
@@ -98,13 +108,13 @@ def play_config(task: str) -> PlayConfig:
     return PlayConfig(
         run=PlayRunConfig(dir=None, env=task),
         physics=PhysicsConfig(impl="auto"),
-        checkpoint=shipped.SHIPPED,
+        checkpoint=SHIPPED,
         num_envs=_EPISODES,
         seed=0,
         deterministic=True,
         max_steps=None,
         video="auto",
-        video_envs=FILMED,
+        video_envs=None,
         html="off",
         width=640,
         height=480,
@@ -153,7 +163,7 @@ def _training(overrides: Sequence[str], task: str) -> Any:
     return compose(*short, *overrides)
 
 
-def _train(config: Any) -> None:
+def _train(config: Any, console: Console) -> None:
     """Trains, plays the last checkpoint and films it."""
     from gmijax.cli.compose import build
     from gmijax.control import job
@@ -164,11 +174,9 @@ def _train(config: Any) -> None:
     curve = RunPaths(result.run_dir).returns_png
     films = sorted(result.run_dir.glob("play/*/*.mp4"))
     has_curve = "none, no episode has ended"
-    sys.stdout.write(
-        f"\nreturn while it learnt: {nearby(curve) if curve.exists() else has_curve}\n"
-        f"film: {nearby(films[-1]) if films else 'none, see above'}\n"
-        f"more training:\n  gmijax train env={config.env.label}\n"
-    )
+    console.print(f"\ncurve of the returns: {nearby(curve) if curve.exists() else has_curve}")
+    console.print(f"film: {nearby(films[-1]) if films else 'none, see above'}")
+    print_next(console, ("train for longer", f"gmijax train env={config.env.label}"))
 
 
 if __name__ == "__main__":

@@ -54,6 +54,10 @@ class ConfigError(GmijaxError):
     """Bad input: the message says what, which value, and which values are allowed."""
 
 
+class NoCheckpointYet(ConfigError):
+    """The checkpoint that is asked for is still to come: the run is being trained."""
+
+
 class BackendUnavailable(ConfigError):
     """The wanted backend cannot be had on this machine; the message says what is missing."""
 

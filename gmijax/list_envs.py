@@ -12,10 +12,12 @@ from typing import Final, NamedTuple
 from rich.table import Table
 
 from gmijax.config.env import ROBOTS
-from gmijax.control.console import open_console, print_next
+from gmijax.control.console import open_console, print_next, training_of
 from gmijax.control.exit_codes import EXIT_OK, exit_code_of
 from gmijax.errors import ConfigError
-from gmijax.sim.registry import SUITES, TASKS, require_task
+from gmijax.machine.snapshot import detect_machine
+from gmijax.sim.registry import SUITES, TASKS, missing_of
+from gmijax.sim.robot_models import how_to_get, models_of
 
 USAGE: Final = """usage: gmijax list-envs
 
@@ -57,7 +59,7 @@ def _list(argv: Sequence[str]) -> None:
     console.print()
     for line in suite_lines():
         console.print(line)
-    print_next(console, ("train on one of them", "gmijax train env=ant"))
+    print_next(console, training_of("ant", has_gpu=bool(detect_machine().gpus)))
 
 
 def task_of(name: str) -> Task:
@@ -86,14 +88,15 @@ def task_of(name: str) -> Task:
 def suite_lines() -> list[str]:
     """A line for each suite of others: how a task of it is named, or what must be installed."""
     lines = [f"env={', env='.join(ROBOTS)}: robots of MuJoCo Playground (docs/tasks.md)"]
-    for suite in SUITES:
-        try:
-            require_task("", suite)
-        except ConfigError as error:
-            if suite != "custom":
-                lines.append(str(error))
-            continue
-        lines.append(f"env={suite} env.name=NAME: installed")
+    if absent := [robot for robot in ROBOTS if missing_of(robot)]:
+        models = sorted({name for robot in absent for name in models_of(ROBOTS[robot])})
+        how = missing_of("playground") or how_to_get(models)
+        lines.append(f"  not installed: {', '.join(absent)}; {how}")
+    lines += [
+        f"env={suite} env.name=NAME: {missing_of(suite) or 'installed'}"
+        for suite in SUITES
+        if suite != "custom"
+    ]
     return [*lines, "env=PATH.py:FUNCTION: a task of your own (docs/custom-task.md)"]
 
 

@@ -25,6 +25,8 @@ class SearchDisplay:
 
     def __init__(self, console: Console, budget_s: float) -> None:
         self._console = console
+        self._budget_s = budget_s
+        self._has_begun = False
         self._started_s = time.monotonic()
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),
@@ -41,6 +43,15 @@ class SearchDisplay:
         self._started_s = time.monotonic()
         self._bar.start()
         return self
+
+    def begin(self) -> None:
+        """Says once what takes the time, before the first profile that is not in the store."""
+        if not self._has_begun:
+            self._has_begun = True
+            self._console.print(
+                "every profile is a short job of its own, which compiles its programs first; "
+                f"at most {self._budget_s:.0f} s in all"
+            )
 
     def __exit__(self, *exc: Any) -> None:
         self._bar.stop()

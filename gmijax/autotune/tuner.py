@@ -16,7 +16,7 @@ from rich.console import Console
 
 from gmijax.autotune.async_workload import A3cWorkload
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
-from gmijax.autotune.profile import ProfileLate, profile
+from gmijax.autotune.profile import LATE, ProfileLate, profile
 from gmijax.autotune.report import SearchDisplay, draw, plain_data, table, verdict
 from gmijax.autotune.search import OutOfBudget, Rules, SearchOutcome, SearchPoint
 from gmijax.autotune.store import ProfileStore
@@ -198,6 +198,7 @@ class Search:
         limit_s = min(left_s, self._settings.profile_limit_s)
         if self.run is None:
             self.run = create_run(None, None, f"{self._workload.config.env.slug}-search")
+        self._display.begin()
         try:
             return profile(
                 self._workload,
@@ -227,7 +228,12 @@ class Search:
             )
         first = outcome.visited[0]
         why = first.result.reason if isinstance(first.result, NotRunnable) else ""
-        raise GmijaxError(f"no point of the search can run; the first, {first.point}: {why}")
+        is_late = why.startswith(LATE)
+        more = "; give more search.budget_s, or smaller sizes in search.num_envs"
+        raise GmijaxError(
+            f"no point of the search can run; the first, {first.point}: {why}"
+            f"{more if is_late else ''}"
+        )
 
 
 def _grid(workload: Workload[Any], machine: Machine) -> Grid:

@@ -92,6 +92,8 @@ def _meant(word: str) -> str:
         return f"; did you mean env={word}?"
     if word == "last" or "/" in word:
         return f"; did you mean run.dir={word}?"
+    if difflib.get_close_matches(word, ("help",), cutoff=0.7):
+        return "; did you mean --help?"
     groups = {name: group for group in ("env", "algo") for name in choices(group)}
     close = difflib.get_close_matches(word, groups, n=1)
     return f"; did you mean {groups[close[0]]}={close[0]}?" if close else ""

@@ -81,7 +81,8 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
         show = True
     for text in arguments:
         if text.startswith("-"):
-            raise ConfigError(
-                f"unknown option {text}: allowed are --help, --verbose, --cfg job, key=value"
-            )
+            key, equals, value = text.lstrip("-").partition("=")
+            meant = f"; did you mean {key.replace('-', '_')}={value}?" if key and equals else ""
+            allowed = "--help, --verbose, --cfg job, key=value"
+            raise ConfigError(f"unknown option {text}: allowed are {allowed}{meant}")
     return arguments, show, verbose

@@ -180,7 +180,10 @@ def _check_override(name: str, item: Override) -> None:
     if re.split(r"[./]", key)[0] == "hydra":
         raise _unknown_key(key, defaults(name, ()))
     if item.is_sweep_override():
-        raise ConfigError(f"{item.input_line}: expected one value (a list stands in brackets)")
+        sweep = "; gmijax sweep takes several" if name == "train" else ""
+        raise ConfigError(
+            f"{item.input_line}: expected one value (a list stands in brackets){sweep}"
+        )
     options = choices(key)
     if item.is_delete() and (key == "env" or (key == "algo" and name != "serve")):
         raise ConfigError(f"{item.input_line}: a job needs one; choose it with {key}=NAME")
@@ -189,8 +192,9 @@ def _check_override(name: str, item: Override) -> None:
     if options and not item.is_delete() and item.value() not in options:
         # Of a few the closest name is a guess: `algo=td3` is no slip for a3c.
         few = f": allowed are {', '.join(options)}" if len(options) < 5 else ""
+        kind = {"env": " task", "algo": " algorithm"}.get(key, "")
         raise ConfigError(
-            f"{key}={item.value()}: unknown{few or suggestion(str(item.value()), options)}"
+            f"{key}={item.value()}: unknown{kind}{few or suggestion(str(item.value()), options)}"
         )
 
 

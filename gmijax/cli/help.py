@@ -14,6 +14,7 @@ from rich.table import Table
 
 from gmijax.config.schema import suggestion
 from gmijax.errors import ConfigError
+from gmijax.sim.registry import missing_of
 
 MANY: Final = 60
 """A command with more keys shows the usual ones unless a topic is named."""
@@ -82,7 +83,12 @@ def print_help(
     console.print(f"usage: {usage_of(name)}")
     for group in ("env", "algo", "plan") if topic in (None, "all") else (topic,):
         if group in {key.name.split(".")[0] for key in keys} and len(choices(group)) > 1:
-            console.print(f"\n{group}= one of: {', '.join(choices(group))}")
+            names = choices(group)
+            absent = [name for name in names if group == "env" and missing_of(name)]
+            marked = ", ".join(f"{name}*" if name in absent else name for name in names)
+            console.print(f"\n{group}= one of: {marked}")
+            if absent:
+                console.print("* not installed: gmijax list-envs prints what to install")
             if group == "env":
                 console.print("or env=PATH.py:FUNCTION, a task of your own (docs/custom-task.md)")
                 console.print(_whose_defaults(name, keys))

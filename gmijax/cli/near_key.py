@@ -1,8 +1,9 @@
-"""The key that a misspelt one may mean, or one that other libraries call so."""
+"""The key that a misspelt or shortened one may mean, or one that other libraries call so."""
 
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
@@ -23,6 +24,9 @@ _ELSEWHERE: Mapping[str, str] = MappingProxyType(
 )
 """What Stable-Baselines3, CleanRL and rsl_rl call it."""
 
+_OF_GROUPS = 0.65
+"""How alike a short name such as `ent` must be to `env`: two of three letters."""
+
 _MOST_SHOWN = 24
 """Keys that an error lists; the help has more."""
 
@@ -39,6 +43,35 @@ def near_key(key: str, known: Collection[str]) -> str:
     if close := difflib.get_close_matches(name, sorted(names), n=1, cutoff=0.75):
         so_called = sorted(one for one in known if one.rpartition(".")[2] == close[0])
         return f": did you mean {difflib.get_close_matches(key, so_called, n=1, cutoff=0.0)[0]}?"
+    groups = {one.partition(".")[0] for one in known} & {"env", "algo"} - {key}
+    if name == key and (group := difflib.get_close_matches(key, groups, 1, _OF_GROUPS)):
+        return f": did you mean {group[0]}?"  # It chooses a task or an algorithm.
+    if near := _by_words(key, known):
+        return f": did you mean {near}?"
     if len(known) <= _MOST_SHOWN or difflib.get_close_matches(key, known, n=1):
         return suggestion(key, known)
     return ": see --help all"
+
+
+def _by_words(key: str, known: Collection[str]) -> str | None:
+    """The key that has words of this one's name: `algo.rate` is `algo.learning_rate`.
+
+    A word counts the less, the more keys have it. Among equals the group decides, then brevity.
+    """
+    words = {one: _words(one) for one in known}
+    count = Counter(word for own in words.values() for word in own)
+    scores: Counter[str] = Counter()
+    for word in _words(key):
+        for close in difflib.get_close_matches(word, count, n=1, cutoff=0.8):
+            scores.update({one: 1 / count[close] for one, own in words.items() if close in own})
+    group = key.rpartition(".")[0]
+
+    def nearness(one: str) -> tuple[float, bool, int, str]:
+        return -scores[one], one.rpartition(".")[0] != group, len(words[one]), one
+
+    return min(scores, key=nearness, default=None)
+
+
+def _words(key: str) -> set[str]:
+    """Of the last part of a key, without units such as `s`."""
+    return {word for word in key.rpartition(".")[2].lower().split("_") if len(word) > 2}

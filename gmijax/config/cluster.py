@@ -21,8 +21,8 @@ class ClusterConfig(KeyGroup):
         default=None,
     )
     address: str = doc(
-        "of the cluster: auto (that of RAY_ADDRESS, or the one that runs here), host:port, or "
-        "local: one for this job on this machine alone",
+        "address of the Ray cluster: auto (RAY_ADDRESS, or the cluster that runs here), "
+        "host:port, or local (a cluster for this job on this machine alone)",
         default="auto",
     )
     nodes: int | Literal["auto"] = doc(

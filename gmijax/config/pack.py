@@ -71,8 +71,8 @@ class PackConfig(JobsConfig):
     )
     max_restarts: int = doc("how often a job that failed is started again", default=0, low=0)
     resume: str | None = doc(
-        "words that are added to the command when a job is started again, may hold placeholders; "
-        "null: it starts from nothing",
+        "arguments that are added to the command when a job is started again, may hold "
+        "placeholders; null: none, it starts from its beginning",
         default=None,
     )
     stop_signal: Literal["TERM", "INT", "USR1", "HUP"] = doc(

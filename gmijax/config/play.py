@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from types import MappingProxyType
+from typing import Any, Final, Literal
 
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.schema import KeyGroup, doc, require_between
 
-FILMED = 4
+FILMED: Final = 4
 """Environments that a film shows."""
+
+_OF_THE_FILM: Final[Mapping[str, Any]] = MappingProxyType(
+    {
+        "num_envs": 16,
+        "seed": 0,
+        "deterministic": True,
+        "randomize": "off",
+        "max_steps": None,
+        "video_envs": None,
+        "camera": None,
+    }
+)
+"""Keys that make another film of the same policy, and the defaults of `configs/play.yaml`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +102,13 @@ class PlayConfig(KeyGroup):
     def num_filmed(self) -> int:
         """How many environments are shown."""
         return min(FILMED, self.num_envs) if self.video_envs is None else self.video_envs
+
+    def film_overrides(self) -> str:
+        """What a command line that makes the same film has beside the policy; begins with ` `."""
+        values = {key: getattr(self, key) for key in _OF_THE_FILM}
+        own = {key: value for key, value in values.items() if value != _OF_THE_FILM[key]}
+        shown = {k: str(v).lower() if isinstance(v, bool) else v for k, v in own.items()}
+        return "".join(f" {key}={value}" for key, value in shown.items())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,7 +42,7 @@ class RunConfig(Timeouts):
     name: str | None = doc("name of the run folder below runs/ (ignored if run.dir is given)")
     resume: str | None = doc(
         "continue from a run folder, from one of its checkpoints, or from `last`, in a new run "
-        "folder; auto: go on in run.dir if there is a checkpoint, else start"
+        "folder; auto: continue in run.dir if it has a checkpoint, else start"
     )
     checkpoint_every: int = doc("iterations between checkpoints; 0: only at the end", low=0)
     keep_checkpoints: int | None = doc(
@@ -52,10 +52,10 @@ class RunConfig(Timeouts):
     )
     max_restarts: int = doc(
         "how often a job whose GMIs were lost is started again from its last good checkpoint; a "
-        "newer checkpoint sets the count back; 0: never",
+        "newer checkpoint resets the count; 0: never",
         low=0,
     )
-    elastic: bool = doc("go on with the GPUs that are left where a restart finds fewer of them")
+    elastic: bool = doc("continue with the remaining GPUs where a restart finds fewer of them")
     measure_throughput: bool = doc(
         "after training, also measure simulation alone and simulation with inference"
     )
@@ -105,8 +105,9 @@ class WandbConfig(KeyGroup):
         "send metrics to Weights & Biases; offline: keep them in the run folder for `wandb sync`",
         default="off",
     )
-    project: str = doc("its project", default="gmijax")
+    project: str = doc("project of the run in Weights & Biases", default="gmijax")
     group: str | None = doc(
-        "its group of runs; null: none, for jobs of a sweep the name of the sweep's folder",
+        "group of the run in Weights & Biases; null: none, for jobs of a sweep the name of its "
+        "folder",
         default=None,
     )

@@ -55,8 +55,8 @@ class SacConfig(PolicyConfig):
         low=2,
     )
     replay_precision: Literal["float32", "float16"] = doc(
-        "of observations and actions in the replay; float16 keeps the distance from the mean, "
-        "by the statistics of the time",
+        "precision of observations and actions in the replay; float16 keeps the distance from the "
+        "mean, by the statistics of the time",
         default="float32",
     )
     save_replay: bool = doc(

@@ -32,8 +32,8 @@ class JobsConfig(KeyGroup):
         "number of GPUs, or their indices as nvidia-smi lists them; null: all", default=None
     )
     jobs_per_gpu: int | Literal["auto"] = doc(
-        "jobs that run at the same time on every GPU (without one: on the machine); auto: as many "
-        "as make the most steps, as is measured",
+        "jobs that run at the same time on every GPU (without one: on the machine); auto: the "
+        "number that makes the most steps, which is measured",
         default="auto",
         low=1,
     )
@@ -50,7 +50,7 @@ class JobsConfig(KeyGroup):
         "ends jobs early that are worse than others were (Optuna); not with the sampler grid",
         default="none",
     )
-    seed: int = doc("of the sampler", default=0, low=0, high=2**31 - 1)
+    seed: int = doc("seed of the sampler", default=0, low=0, high=2**31 - 1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -78,13 +78,14 @@ class SweepConfig(JobsConfig):
 
     pack: Literal["gmi", "vmap", "auto"] = doc(
         "how jobs share a GPU: each in processes of its own (gmi), those that differ in seed and "
-        "learning rate alone as one program (vmap; only with sampler=grid), or so where they can "
-        "(auto)",
+        "learning rate alone as one program (vmap; only with sampler=grid), or as one where "
+        "possible (auto)",
         default="gmi",
     )
     objective: str = doc(
-        "what jobs are ranked by: a key of their metrics, of means over episodes at the end of a "
-        "job, of evaluations the best; auto: eval/return if all jobs have eval.every, else return",
+        "what jobs are ranked by: a key of their metrics. Means over episodes count at the end of "
+        "a job, evaluations at their best; auto: eval/return if all jobs have eval.every, else "
+        "return",
         default="auto",
     )
 

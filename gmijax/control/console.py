@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any, Literal, TextIO, TypeAlias
+from typing import Any, Final, Literal, TextIO, TypeAlias
 
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -20,6 +20,9 @@ from gmijax.runs.names import nearby
 
 Show: TypeAlias = bool | Literal["verbose"]
 """Whether a command prints what it does; verbose: also why it decided so."""
+
+SMALL_TASK: Final = "ball_balance"
+"""What two cores of a CPU learn within minutes; other tasks take hours there."""
 
 _DECISIONS = (
     *("template ", "strategy ", "backend ", "intra ", "physics.impl ", "sm_percent "),
@@ -137,3 +140,11 @@ def print_next(console: Console, *steps: tuple[str, str]) -> None:
     """Ends the output of a command with those to type next, as (what for, command)."""
     for purpose, command in steps:
         console.print(f"\nNext: {purpose}\n  {command}")
+
+
+def training_of(task: str, *, has_gpu: bool) -> tuple[str, str]:
+    """A training as a step for `print_next`; without a GPU that of a task small enough."""
+    if has_gpu or task == SMALL_TASK:
+        return f"train {task} yourself", f"gmijax train env={task}"
+    purpose = f"train one yourself; a CPU learns {SMALL_TASK} within minutes, {task} takes a GPU"
+    return purpose, f"gmijax train env={SMALL_TASK}"

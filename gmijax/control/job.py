@@ -55,7 +55,6 @@ from gmijax.sim import source
 from gmijax.supervise.job_kinds import training_kind
 from gmijax.supervise.run_gmis import Launch, recorded
 from gmijax.supervise.watched_gmi import GmiStatus
-from gmijax.version import versions_of
 
 
 class Result(NamedTuple):
@@ -237,8 +236,7 @@ def _programs_of(config: TrainConfig, plan: Plan, machine: Machine) -> dict[str,
         "eval": config.eval.every is not None,
         "layout": plan.layout.gmis_of_gpu,
         "template": plan.template,
-        "device": plan.backend if plan.backend == "cpu" else machine.gpus[0].name,
-        "versions": versions_of(("gmijax", "jax", "jaxlib", "mujoco-mjx")),
+        "device": "cpu" if plan.backend == "cpu" else machine.gpus[0].name,
     }
 
 

@@ -11,14 +11,13 @@ from rich.table import Table
 from rich.text import Text
 
 from gmijax.control.display import LiveDisplay, bar, clock
+from gmijax.control.phases import BEFORE_RUNNING, Phases
+from gmijax.control.time_left import TimeLeft
 from gmijax.runs.compile_times import CompileTime
 from gmijax.supervise.watched_gmi import GmiStatus
 
 _LINE_EVERY_S: Final = 30.0
 """Between two plain lines."""
-
-_LONG_S: Final = 180.0
-"""Compiling for longer than that is not usual."""
 
 
 class ConsoleProgress:
@@ -26,9 +25,10 @@ class ConsoleProgress:
 
     Args:
       console: nothing is shown on a quiet one.
-      new: the lines of metrics that came since the last call.
+      new: the lines of metrics that came since the last call; a job may have none at all.
       num_timesteps: environment steps of the whole job.
       compile_time: what is known of the time that compiling takes; None: nothing.
+      work: what the job does once it runs, for one without metrics.
     """
 
     def __init__(
@@ -37,15 +37,16 @@ class ConsoleProgress:
         new: Callable[[], Sequence[dict[str, Any]]],
         num_timesteps: int,
         compile_time: CompileTime | None = None,
+        work: str = "",
     ) -> None:
         self._console = console
         self._new = new
         self._num_timesteps = num_timesteps
-        self._compile_time = compile_time
+        self._work = work
+        self._phases = Phases(compile_time, work or "running")
         self._line: dict[str, Any] = {}
         self._evaluated: float | None = None
-        self._first: tuple[float, int] | None = None
-        self._phase, self._phase_began_s = "", time.monotonic()
+        self._left = TimeLeft()
         self._shown: tuple[str, int | None] = ("", None)
         self._shown_s = 0.0
         self._display = LiveDisplay(console)
@@ -68,49 +69,38 @@ class ConsoleProgress:
         for line in self._new():
             self._line = line
             self._evaluated = line.get("eval/return", self._evaluated)
-            if self._first is None:
-                self._first = (time.monotonic(), line["env_steps"])
-        self._enter_phase(_phase_of(gmis))
+        if self._line:
+            self._left.note(self._line["env_steps"])
+        if (compiled := self._phases.enter(gmis)) is not None:
+            self._console.print(compiled, style="dim")
         if self._display.has_panel:
             return self._panel(gmis)
         self._print_now_and_then(gmis)
         return None
 
-    def _enter_phase(self, phase: str) -> None:
-        if phase == self._phase:
-            return
-        now_s = time.monotonic()
-        if self._phase == "compiling" and phase == "running":
-            compile_s = now_s - self._phase_began_s
-            if compile_s >= 1:
-                self._console.print(f"compiled in {clock(compile_s)}", style="dim")
-            if self._compile_time is not None:
-                self._compile_time.note(compile_s)
-        self._phase, self._phase_began_s = phase, now_s
-
     def _print_now_and_then(self, gmis: Sequence[GmiStatus]) -> None:
         now_s, steps = time.monotonic(), self._line.get("env_steps")
-        is_due = now_s - self._shown_s > _LINE_EVERY_S
-        if self._phase == self._shown[0] and not is_due:
+        phase, is_due = self._phases.now, now_s - self._shown_s > _LINE_EVERY_S
+        if phase == self._shown[0] and not is_due:
             return
-        if self._has_figures or self._phase != "running":
-            text = self._text() if self._has_figures else self._waiting()
+        if self._has_figures or self._work or phase != "running":
+            text = self._text() if self._has_figures else self._phases.text()
             states = f"  [{_states(gmis)}]" if len(gmis) > 1 else ""
             self._console.print(f"{text}{states}")
-            self._shown, self._shown_s = (self._phase, steps), now_s
+            self._shown, self._shown_s = (phase, steps), now_s
 
     def _panel(self, gmis: Sequence[GmiStatus]) -> Table:
         grid = Table.grid()
         if self._has_figures:
-            done = Text.assemble(bar(self._part()), f"  {self._done()}  ETA {self._eta()}")
+            done = Text.assemble(bar(self._part()), f"  {self._done()}{self._eta()}")
             grid.add_row(done)
             grid.add_row(Text(self._figures()))
         else:
-            grid.add_row(Text(self._waiting()))
+            grid.add_row(Text(self._phases.text()))
         for gmi in gmis if len(gmis) > 1 else ():
             done_so_far = f", iteration {gmi.iteration}" if gmi.iteration else ""
             grid.add_row(Text(f"GMI {gmi.gmi}: {gmi.state}{done_so_far}", "dim"))
-        if self._phase == "stopping":
+        if self._phases.now == "stopping":
             grid.add_row(Text("stopping: saving a checkpoint", "dim"))
         elif self._has_figures and self._part() == 1:
             grid.add_row(Text("finishing: saving a checkpoint, measuring the rates", "dim"))
@@ -119,30 +109,14 @@ class ConsoleProgress:
     @property
     def _has_figures(self) -> bool:
         """Whether it trains; a job that is started again has lines of before."""
-        return bool(self._line) and self._phase not in ("starting", "waiting", "compiling")
-
-    def _waiting(self) -> str:
-        """What is done before the first iteration, why, and for how long."""
-        waited_s = time.monotonic() - self._phase_began_s
-        return f"{self._reason(waited_s)}  {clock(waited_s)}"
-
-    def _reason(self, waited_s: float) -> str:
-        if self._phase == "compiling":
-            last_s = None if self._compile_time is None else self._compile_time.last_s
-            usual = "usually 1 to 3 minutes" if last_s is None else f"last time {clock(last_s)}"
-            if last_s is not None and last_s < 1:
-                usual = "last time less than a second"
-            if waited_s > 2 * (last_s or _LONG_S):
-                usual += ", longer now"
-            return f"compiling: once for each task and size, {usual}"
-        if self._phase == "waiting":
-            return "waiting: another job compiles the same programs"
-        if self._phase == "starting":
-            return "starting: loading JAX, building the environments"
-        return self._phase
+        return bool(self._line) and self._phases.now not in BEFORE_RUNNING
 
     def _text(self) -> str:
-        return f"{self._done()}  {self._figures()}  ETA {self._eta()}"
+        return f"{self._done()}  {self._figures()}{self._eta()}"
+
+    def _eta(self) -> str:
+        left_s = self._left.seconds(self._num_timesteps)
+        return "" if left_s is None else f"  ETA {clock(left_s)}"
 
     def _part(self) -> float:
         return min(self._line["env_steps"] / self._num_timesteps, 1.0)
@@ -158,25 +132,6 @@ class ConsoleProgress:
             f"{line['env_steps']:,} steps  {_rates(line)}  "
             f"return {'-' if mean is None else format(mean, '.2f')}{evaluated}"
         )
-
-    def _eta(self) -> str:
-        if self._first is None or self._line["env_steps"] <= self._first[1]:
-            return "-"
-        since_s, steps = self._first
-        rate = (self._line["env_steps"] - steps) / (time.monotonic() - since_s)
-        return clock(max(0.0, (self._num_timesteps - self._line["env_steps"]) / rate))
-
-
-def _phase_of(gmis: Sequence[GmiStatus]) -> str:
-    """Phase of the job: that of its slowest GMIs."""
-    states, early = {gmi.state for gmi in gmis}, {"starting", "waiting"}
-    if states == {"waiting"}:
-        return "waiting"
-    if states and states <= early:
-        return "starting"
-    if states & {*early, "compiling"}:
-        return "compiling"
-    return "stopping" if "stopping" in states else "running"
 
 
 def _states(gmis: Sequence[GmiStatus]) -> str:

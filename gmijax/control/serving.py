@@ -29,6 +29,7 @@ from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import SIMULATOR, group_of
+from gmijax.runs.compile_times import CompileTime
 from gmijax.runs.dataset import DataPaths, open_dataset
 from gmijax.runs.folder import (
     RunPaths,
@@ -242,7 +243,8 @@ def _run(
     started_s = time.monotonic()
     lines = _CollectedLines(run, job.simulators, kept * job.steps_per_unroll)
     total = job.wanted_unrolls * job.steps_per_unroll
-    progress = ConsoleProgress(console, lines.new, total)
+    compile_time = CompileTime(_programs_of(job))
+    progress = ConsoleProgress(console, lines.new, total, compile_time)
 
     def on_tick(gmis: tuple[GmiStatus, ...]) -> None:
         for folder in folders:
@@ -265,6 +267,20 @@ def _run(
     with recorded(run, partial(_what_is_left, job), record), progress:
         run_gmis(launch, on_tick)
     return read_json(run.summary)
+
+
+def _programs_of(job: _ServingJob) -> dict[str, Any]:
+    """What the time to compile a job's programs depends on."""
+    plan, is_on_cpu = job.plan, job.plan.backend == "cpu"
+    return {
+        "command": "serve",
+        **{name: to_dict(getattr(job.config, name)) for name in ("env", "physics")},
+        "num_envs": plan.num_envs_per_gmi,
+        "unroll_length": job.config.unroll_length,
+        "layout": plan.layout.gmis_of_gpu,
+        "template": plan.template,
+        "device": "cpu" if is_on_cpu else job.machine.gpus[0].name,
+    }
 
 
 def _output(job: _ServingJob, kept: int) -> dict[str, Any] | None:

@@ -147,10 +147,11 @@ def _of_profile(found: Data | None) -> str:
     if found["iterations"] is None:
         return "profile: none, the command ended before the first iteration of run.profile\n"
     first, last = found["iterations"]
-    folder = nearby(Path(found["dir"]))
+    folder = Path(found["dir"])
+    traces = sorted(folder.rglob("perfetto_trace.json.gz"))
     return (
-        f"profile of the iterations {first} to {last}: {folder}\n"
-        "  open perfetto_trace.json.gz in it at https://ui.perfetto.dev (docs/speed.md)\n"
+        f"profile of iterations {first} to {last}: {nearby(traces[-1] if traces else folder)}\n"
+        "  open it at https://ui.perfetto.dev; how to read it: docs/speed.md\n"
     )
 
 

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Final
 
 from gmijax.config import ExportConfig, PlanConfig, ReduceConfig, Timeouts
-from gmijax.control.console import Show, doing, nearby, open_console, print_next
+from gmijax.control.console import Show, nearby, open_console, print_next
+from gmijax.control.progress import ConsoleProgress
 from gmijax.deploy.trained_run import open_run, output_folder
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
@@ -45,8 +46,8 @@ def export(config: ExportConfig, *, show: Show = False) -> ExportPaths:
     console.print(f"checkpoint: {nearby(Path(str(config.checkpoint)))}")
     if changed:
         console.print(changed)
-    with doing(console, "exporting the policy"):
-        run_gmis(launch_of(paths))
+    with ConsoleProgress(console, list, 0, work="exporting the policy") as progress:
+        run_gmis(launch_of(paths), progress.update)
     if config.format in ("onnx", "all"):
         console.print(f"ONNX: {nearby(paths.onnx)}")
     if config.format in ("stablehlo", "all"):

@@ -20,7 +20,16 @@ from gmijax.config import (
     ReduceConfig,
     Timeouts,
 )
-from gmijax.control.console import Show, doing, nearby, open_console, print_next
+from gmijax.config.schema import to_dict
+from gmijax.control.console import (
+    Show,
+    doing,
+    nearby,
+    open_console,
+    print_next,
+    training_of,
+)
+from gmijax.control.progress import ConsoleProgress
 from gmijax.control.summary import EXPLORING
 from gmijax.deploy import shipped
 from gmijax.deploy.pictures import film, write_page
@@ -31,6 +40,7 @@ from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
 from gmijax.player.joystick import robot_of
 from gmijax.player.walking import ONE_ACTION, lines_of
+from gmijax.runs.compile_times import CompileTime
 from gmijax.runs.folder import (
     PlayPaths,
     RunPaths,
@@ -77,9 +87,25 @@ def play(config: PlayConfig, *, show: Show = False) -> None:
         console.print(f"checkpoint: {nearby(Path(str(config.checkpoint)))}")
         if changed:
             console.print(changed)
-        with doing(console, f"playing {config.num_envs} episodes"):
-            run_gmis(launch_of(config, paths, detect_machine()))
+        machine = detect_machine()
+        compile_time = CompileTime(_programs_of(config, machine))
+        work = f"playing {config.num_envs} episodes"
+        with ConsoleProgress(console, list, 0, compile_time, work) as progress:
+            run_gmis(launch_of(config, paths, machine), progress.update)
     _show(config, paths, console)
+
+
+def _programs_of(config: PlayConfig, machine: Machine) -> dict[str, Any]:
+    """What the time to compile them depends on."""
+    env, algo = trained_config(Path(str(config.checkpoint)))
+    return {
+        "command": "play",
+        **{name: to_dict(part) for name, part in (("env", env), ("algo", algo))},
+        "physics": to_dict(config.physics),
+        "num_envs": config.num_envs,
+        "randomize": config.randomize,
+        "device": machine.gpus[0].name if machine.gpus else "cpu",
+    }
 
 
 def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
@@ -123,7 +149,7 @@ def _return_while_training(config: PlayConfig, returns: Mapping[str, Any]) -> st
     at_it = [line.get("return") for line in lines if line["env_steps"] == returns["env_steps"]]
     if not at_it or at_it[-1] is None or not returns["deterministic"]:
         return None
-    return f"while training: {at_it[-1]:.2f} {EXPLORING}"
+    return f"return during training: {at_it[-1]:.2f} {EXPLORING}"
 
 
 def _next_steps(config: PlayConfig, label: str) -> tuple[tuple[str, str], ...]:
@@ -131,7 +157,7 @@ def _next_steps(config: PlayConfig, label: str) -> tuple[tuple[str, str], ...]:
         task = config.run.env
         return (
             ("watch it in the browser", f"gmijax view env={task} checkpoint={SHIPPED}"),
-            ("train it yourself", f"gmijax train env={task}"),
+            training_of(str(task), has_gpu=bool(detect_machine().gpus)),
         )
     folder = shlex.quote(nearby(Path(str(config.run.dir))))
     view = ("watch it in the browser", f"gmijax view run.dir={folder}")

@@ -19,7 +19,9 @@ from gmijax.runs.resume import (
     best_checkpoint,
     checkpoints_of,
     find_checkpoint,
+    first_checkpoint_of,
     rank_of,
+    unsaved_runs,
 )
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
@@ -41,6 +43,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
       executed, also what is not as the run had it (None if nothing).
 
     Raises:
+      NoCheckpointYet: the run is being trained, and has none yet.
       ConfigError: no such run or checkpoint, or its task cannot be had.
     """
     if config.run.env is not None and ".py" not in config.run.env:
@@ -49,6 +52,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
         raise ConfigError(f"env={config.run.env}: {why}")
     checkpoint = checkpoint_of(config)
     early = None
+    is_last = config.checkpoint in (None, "best") and config.run.dir in (None, "last")
     if config.checkpoint == "best" and not rank_of(checkpoint).is_full:
         early = (
             "checkpoint=best: none has an evaluation or a full window of episodes to compare by"
@@ -65,6 +69,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
         source.changes(env, dataclasses.asdict(saved)),
         left_out(checkpoint),
         early,
+        *(f"{run}: {first_checkpoint_of(run)}" for run in (unsaved_runs() if is_last else ())),
     )
     return config, env, "\n".join(filter(None, notes)) or None
 

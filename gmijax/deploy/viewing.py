@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import queue
 import socket
+import time
+from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from rich.console import Console
 
 from gmijax.config import EnvConfig, ViewConfig
-from gmijax.control.console import nearby, open_console
+from gmijax.control.console import doing, nearby, open_console
 from gmijax.deploy.shipped import SHIPPED
 from gmijax.deploy.trained_run import open_run
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, NoCheckpointYet
 from gmijax.player.plain_env import PlainEnv, task_of
 from gmijax.player.policy import PlainPolicy, checkpoint_policy
 from gmijax.player.shipped import require_shipped, shipped_policy
@@ -25,6 +27,8 @@ from gmijax.viewer.guard import Guard, is_loopback
 from gmijax.viewer.installed import INSTALL, missing
 from gmijax.viewer.requests import Request
 from gmijax.viewer.simulation import Simulation
+
+_POLL_S: Final = 0.5
 
 
 def view(config: ViewConfig, *, show: bool = False) -> None:
@@ -37,12 +41,13 @@ def view(config: ViewConfig, *, show: bool = False) -> None:
     Raises:
       ConfigError: bad input, e.g. no such checkpoint, or a package that is not installed.
     """
-    shown = _shipped(config) if config.checkpoint == SHIPPED else _of_run(config)
+    console = open_console(show=show)
+    shown = _shipped(config) if config.checkpoint == SHIPPED else _of_run(config, console)
     envs = [PlainEnv(shown.env, seed=config.seed + number) for number in range(config.num_envs)]
     _require_fit(shown.policy, envs[0])
     require_packages()
     simulation = Simulation(envs, shown.policy, config.seed)
-    _serve(config, simulation, shown, open_console(show=show))
+    _serve(config, simulation, shown, console)
 
 
 class _Shown(NamedTuple):
@@ -63,13 +68,30 @@ def _shipped(config: ViewConfig) -> _Shown:
     return _Shown(task_of(policy), policy, None, False, lines)
 
 
-def _of_run(config: ViewConfig) -> _Shown:
+def _of_run(config: ViewConfig, console: Console) -> _Shown:
     """The policy of a checkpoint of a run."""
     follow = config.checkpoint is None
-    config, env, changed = open_run(config)
+    config, env, changed = opened_once_saved(config, console)
     checkpoint = Path(str(config.checkpoint))
     lines = (f"checkpoint: {nearby(checkpoint)}", *filter(None, (changed,)))
     return _Shown(env, checkpoint_policy(checkpoint), checkpoint, follow, lines)
+
+
+def opened_once_saved(
+    config: ViewConfig, console: Console
+) -> tuple[ViewConfig, EnvConfig, str | None]:
+    """As `open_run`; waits for the first checkpoint of a run that is being trained."""
+    with ExitStack() as waiting:
+        is_waiting = False
+        while True:
+            try:
+                return open_run(config)
+            except NoCheckpointYet as error:
+                if not is_waiting:
+                    require_packages()  # Rather now than after the wait.
+                    waiting.enter_context(doing(console, f"waiting: {error}"))
+                is_waiting = True
+            time.sleep(_POLL_S)
 
 
 def _require_fit(policy: PlainPolicy, env: PlainEnv) -> None:

@@ -11,6 +11,7 @@ from typing import Any, Final
 from gmijax.errors import ConfigError
 from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import read_json, write_json
+from gmijax.version import versions_of
 
 _NAME: Final = "compile_times.json"
 
@@ -22,11 +23,12 @@ class CompileTime:
     """The seconds of one kind of program, kept in the cache folder.
 
     Args:
-      kind: what the program depends on: task, sizes, device, versions.
+      kind: what the program depends on beside versions: task, sizes, device.
     """
 
     def __init__(self, kind: Mapping[str, Any]) -> None:
-        text = json.dumps(kind, sort_keys=True, default=str)
+        versions = versions_of(("gmijax", "jax", "jaxlib", "mujoco-mjx"))
+        text = json.dumps({**kind, "versions": versions}, sort_keys=True, default=str)
         self._key = hashlib.sha256(text.encode()).hexdigest()[:16]
         seconds = _times().get(self._key)
         self.last_s = seconds if isinstance(seconds, int | float) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 import math
@@ -9,12 +10,13 @@ import os
 import shutil
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from gmijax.config.schema import from_dict
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, NoCheckpointYet
 from gmijax.runs.folder import (
     META,
     REMOVED,
@@ -24,6 +26,7 @@ from gmijax.runs.folder import (
     open_regular,
     read_json,
 )
+from gmijax.runs.held import is_locked
 from gmijax.runs.names import by_steps, steps_name, steps_of
 
 _CHUNK_BYTES: Final = 1 << 20
@@ -210,6 +213,7 @@ def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
     `runs/` with the newest checkpoint.
 
     Raises:
+      NoCheckpointYet: there is none, and the run is being trained.
       ConfigError: there is none.
     """
     folder = _named(wanted, key)
@@ -219,6 +223,8 @@ def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
         return folder.resolve(), ()
     found = newest_checkpoint(folder)
     if found.checkpoint is None:
+        if not found.passed_over and is_training(folder):
+            raise NoCheckpointYet(f"{key}={wanted}: {first_checkpoint_of(folder)}")
         raise ConfigError(
             "; ".join((f"{key}={wanted}: {_no_checkpoint(folder)}", *found.passed_over))
         )
@@ -251,23 +257,56 @@ def _no_checkpoint(folder: Path) -> str:
 def _named(wanted: str, key: str) -> Path:
     folder = last_run(key) if wanted == "last" else Path(wanted)
     if not os.path.isdir(folder):  # Unlike `Path.is_dir` it takes any text.
-        raise ConfigError(f"{key}={wanted}: no such folder")
+        raise ConfigError(f"{key}={wanted}: no such folder{_near_folder(folder)}")
     return folder
+
+
+def _near_folder(folder: Path) -> str:
+    """`; did you mean ...` for a name that is close to that of a folder beside it."""
+    try:
+        names = [path.name for path in _folders_in(folder.parent)]
+    except (OSError, ValueError):  # Not to be read, or no name that a folder can have.
+        return ""
+    close = difflib.get_close_matches(folder.name, names, n=1)
+    return f"; did you mean {folder.parent / close[0]}?" if close else ""
 
 
 def last_run(key: str) -> Path:
     """The run folder below `RUNS` whose newest checkpoint was written last.
 
     Raises:
+      NoCheckpointYet: there is none, and a run is being trained.
       ConfigError: there is none.
     """
     found = {path: run for run in _folders_in(RUNS) for path in checkpoints_of(run)[-1:]}
+    if not found and (unsaved := unsaved_runs()):
+        raise NoCheckpointYet(f"{key}=last: {unsaved[0]}: {first_checkpoint_of(unsaved[0])}")
     if not found:
         raise ConfigError(
             f"{key}=last: no run with a checkpoint in {RUNS}/; train one: "
             "gmijax train env=ball_balance"
         )
     return found[max(found, key=_written_s)]
+
+
+def unsaved_runs() -> list[Path]:
+    """The run folders below `RUNS` that are being trained and have no checkpoint yet."""
+    return [run for run in _folders_in(RUNS) if is_training(run) and not checkpoints_of(run)]
+
+
+def is_training(folder: Path) -> bool:
+    """Whether a job trains in a run folder now."""
+    paths = RunPaths(folder)
+    return os.path.isfile(paths.config) and is_locked(paths.lock)
+
+
+def first_checkpoint_of(folder: Path) -> str:
+    """When a run that is being trained saves its first checkpoint, in words."""
+    every = None
+    with suppress(ConfigError, LookupError, TypeError):
+        every = read_json(RunPaths(folder).config)["run"]["checkpoint_every"]
+    when = f"after {every} iterations (run.checkpoint_every)" if every else "when it ends"
+    return f"still training, no checkpoint yet; the first is saved {when}"
 
 
 def _written_s(checkpoint: Path) -> tuple[float, float]:

@@ -69,6 +69,19 @@ def require_task(name: str, suite: str = "gmijax") -> None:
         raise ConfigError(f"env={name}: unknown task; allowed are {', '.join(task_names())}")
 
 
+def missing_of(choice: str) -> str | None:
+    """What a value of `env=` needs that is not on this machine, in words; None: nothing."""
+    try:
+        if choice in ROBOTS:
+            require_task(choice, "playground")
+            require_models(playground_name(choice), choice)
+        elif choice in _PACKAGES:
+            require_task("", choice)
+    except ConfigError as error:
+        return str(error).partition(": ")[2]
+    return None
+
+
 def require_env(env: EnvConfig) -> None:
     """Raises ConfigError unless the task of a configuration may be had so; needs no jax."""
     require_task(str(env.name), env.suite)

@@ -10,7 +10,6 @@ import dataclasses
 import signal
 import tempfile
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ from gmijax.autotune.store import ProfileStore
 from gmijax.autotune.tuner import workload_of
 from gmijax.clock import running_s
 from gmijax.config.sweep import SweepConfig
-from gmijax.control.console import is_verbose
+from gmijax.control.console import doing, is_verbose
 from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.result import TrainResult
 from gmijax.supervise.run_gmis import StopSignals
@@ -134,7 +133,12 @@ def _best(
         point = Point(count, config.envs_per_gmi, str(config.physics.impl))
         packed = min(count, together)
         kind = "sweep" if packed == 1 else f"sweep {packed} together"
-        measure = partial(_profile, settings, job, count, bench, together)
+
+        def measure(count: int = count) -> Measured | NotRunnable:
+            what = f"{config.env.label}: measuring {count} jobs at a time; they compile first"
+            with doing(console, what):
+                return _profile(settings, job, count, bench, together)
+
         found = store.kept_or(kind, point, measure, limit_s)
         if isinstance(found, NotRunnable):
             console.print(

@@ -16,6 +16,7 @@ import numpy as np
 from rich.table import Table
 
 from gmijax.config.sweep import Ranking
+from gmijax.control.display import clock
 from gmijax.runs.folder import write_bytes, write_json, write_text
 from gmijax.runs.held import OpenFolder
 from gmijax.sweeps.any_job import AnyJob, label_of, trainings_per_hour
@@ -162,36 +163,51 @@ def tables(report: Mapping[str, Any], ranking: Ranking) -> list[Table]:
     """The ranking for people: of settings, where they have several seeds, and of jobs."""
     jobs = _job_table(report["jobs"], ranking)
     settings = report["settings"]
-    if all(len(setting["jobs"]) == 1 for setting in settings):
-        return [jobs]
-    return [_setting_table(settings, ranking), jobs]
+    has_seeds = any(len(setting["jobs"]) > 1 for setting in settings)
+    return [_setting_table(settings, ranking), jobs] if has_seeds and report["ranking"] else [jobs]
 
 
 def _setting_table(settings: Sequence[Row], ranking: Ranking) -> Table:
     mean = f"{ranking.objective}, interquartile mean"
-    table = _table("rank", "setting", mean, "quartiles", "n")
+    rows: list[Sequence[str]] = []
     for rank, setting in enumerate(settings, 1):
         label, of = label_of(setting["overrides"]) or "all seeds", len(setting["jobs"])
         n = str(of) if setting["n"] == of else f"{setting['n']} of {of}"
         if setting["quartiles"] is None:
-            table.add_row("-", label, "-", "-", n)
+            rows.append(("-", label, "-", "-", n))
             continue
         low, high = setting["quartiles"]
         note = "" if setting["window_full"] else " (windows not full)"
         middle = f"{setting['interquartile_mean']:.4g}{note}"
-        table.add_row(str(rank), label, middle, f"{low:.4g} to {high:.4g}", n)
-    return table
+        rows.append((str(rank), label, middle, f"{low:.4g} to {high:.4g}", n))
+    return _table(("rank", "setting", mean, "quartiles", "n"), rows)
 
 
-def _job_table(rows: Sequence[Row], ranking: Ranking) -> Table:
+def _job_table(jobs: Sequence[Row], ranking: Ranking) -> Table:
     """Below the ranking are jobs without a value, such as those that have failed."""
-    table = _table("rank", "job", "overrides", ranking.objective, "steps", "state")
-    listed = [(str(rank), row) for rank, row in enumerate(ranked(rows, ranking), 1)]
-    listed += [("-", row) for row in rows if row["value"] is None]
+    rows: list[Sequence[str]] = []
+    is_ranked = any(row["value"] is not None for row in jobs)
+    listed = [(str(rank), row) for rank, row in enumerate(ranked(jobs, ranking), 1)]
+    listed += [("-", row) for row in jobs if row["value"] is None]
     for rank, row in listed:
         value = shown(row["value"], row["window_full"], row["episodes"])
-        label, steps = label_of(row["overrides"]), f"{row['env_steps']:,}"
-        table.add_row(rank, str(row["job"]), label, value, steps, row["state"])
+        label, steps = label_of(row["overrides"]), row["env_steps"]
+        wall = "" if is_ranked else clock(row["wall_s"])
+        steps = f"{steps:,}" if steps else "-"
+        rows.append((rank, str(row["job"]), label, value, steps, wall, row["state"]))
+    headings = ("rank", "job", "overrides", ranking.objective, "steps", "time", "state")
+    return _table(headings, rows)
+
+
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """A table without the columns in which there is nothing."""
+    table = Table(box=None, pad_edge=False)
+    cells = [column for column in zip(*rows, strict=True)] or [()] * len(headings)
+    kept = [n for n, column in enumerate(cells) if set(column) - {"", "-"}]
+    for number in kept:
+        table.add_column(headings[number])
+    for row in rows:
+        table.add_row(*(row[number] for number in kept))
     return table
 
 
@@ -203,13 +219,6 @@ def shown(value: float | None, is_full: bool, episodes: int | None) -> str:
         return f"{value:.4g}"
     over = "" if episodes is None else f"{episodes:,} episodes, "
     return f"{value:.4g} ({over}window not full)"
-
-
-def _table(*headings: str) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for heading in headings:
-        table.add_column(heading)
-    return table
 
 
 def draw_curves(jobs: Sequence[AnyJob], ranking: Ranking, paths: SweepPaths) -> None:

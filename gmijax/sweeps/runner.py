@@ -103,16 +103,16 @@ def _run(
         job_events.end(report.data)
         if isinstance(error, JobInterrupted | SweepFailed):
             error.add_note(
-                f"the same command with run.dir={shlex.quote(nearby(paths.root))} goes on"
+                f"continue: the same command with run.dir={shlex.quote(nearby(paths.root))}"
             )
         raise
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
     job_events.end(report.data)
-    print_outcome(console, report.data, work.ranking, paths, view.line())
+    print_outcome(console, report.data, work.ranking, paths, view.line(), work.hint(report.data))
     _require_success(failed, len(jobs), wrong)
-    if report.data["ranking"]:
-        print_next(console, work.next_step(paths, report.data["ranking"][0]))
+    if ranking := report.data["ranking"]:
+        print_next(console, work.next_step(paths, ranking[0]))
     return SweepResult(paths.root, report.data)
 
 

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, Final, Self, cast
 
 from rich.console import Console
 
@@ -32,6 +32,11 @@ from gmijax.sweeps.space import Space
 from gmijax.sweeps.study import MakeJob
 from gmijax.sweeps.training import TrainingKind
 from gmijax.sweeps.work import Folder, Work
+
+_COMPILES: Final = (
+    "the first job of each task and size compiles its programs, usually 1 to 3 minutes; the rest "
+    "load them"
+)
 
 
 @dataclass(frozen=True)
@@ -110,8 +115,10 @@ class SweepWork(Work[Job]):
     def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """See `Work`."""
         del sites
-        warning = why_not_comparable(self.configs, self.ranking)
-        return () if warning is None else (warning,)
+        said = (why_not_comparable(self.configs, self.ranking),)
+        if any(job.progress.state != "completed" for job in self.jobs):
+            said = (*said, _COMPILES)
+        return tuple(filter(None, said))
 
 
 def sweep_of(

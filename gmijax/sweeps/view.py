@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -11,12 +12,15 @@ from rich.text import Text
 
 from gmijax.config.sweep import Ranking
 from gmijax.control.display import LiveDisplay, bar, clock
+from gmijax.control.time_left import TimeLeft
 from gmijax.sweeps.any_job import AnyJob, label_of, trainings_per_hour
 from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import shown
 
-_WHERE = "GPU and slot"
-_HEADINGS = ("job", "overrides", _WHERE, "progress", "steps/s", "{}", "ranked by", "ETA", "state")
+_HEADINGS = (
+    *("job", "overrides", "GPU and slot", "progress", "steps/s", "{}", "ranked by", "ETA"),
+    "state",
+)
 _MOST_ROWS = 30
 _BAR_WIDTH = 6
 _ORDER = ("running", "failed", "interrupted", "waiting", "pruned", "completed")
@@ -34,6 +38,7 @@ class SweepView:
     def __init__(self, console: Console, jobs: Sequence[AnyJob], ranking: Ranking) -> None:
         self._console, self._jobs, self._ranking = console, jobs, ranking
         self._states: dict[int, tuple[str, int]] = {}
+        self._left: defaultdict[int, TimeLeft] = defaultdict(TimeLeft)
         self._display = LiveDisplay(console)
 
     def __enter__(self) -> Self:
@@ -60,6 +65,9 @@ class SweepView:
         return "; ".join(filter(None, (counts, ", ".join(parts))))
 
     def _show(self) -> Group | None:
+        for job in self._jobs:
+            if job.progress.state == "running" and job.progress.env_steps:
+                self._left[job.number].note(job.progress.env_steps)
         self._print_changes()
         return Group(self._table(), Text(self.line())) if self._display.has_panel else None
 
@@ -80,25 +88,30 @@ class SweepView:
             return f"{what}{where}{f' ({progress.note})' if progress.note else ''}"
         if progress.error:
             return f"{what}: {progress.error}"
-        value = shown(progress.value, progress.is_full, progress.episodes)
-        name = self._ranking.objective
-        return f"{what} after {progress.wall_s:.0f} s, {name} {value}; {self.line()}"
+        value = ""
+        if progress.value is not None:
+            found = shown(progress.value, progress.is_full, progress.episodes)
+            value = f", {self._ranking.objective} {found}"
+        return f"{what} after {progress.wall_s:.0f} s{value}; {self.line()}"
 
     def _table(self) -> Table:
+        rows = sorted(self._jobs, key=lambda job: _ORDER.index(job.progress.state))
+        names = _short_names(self._jobs)
+        cells = []
+        for job in rows[:_MOST_ROWS]:
+            label = label_of({names[key]: value for key, value in job.overrides.items()})
+            left_s = self._left[job.number].seconds(job.num_timesteps or 0)
+            cells.append(_row(job, job.progress, label, left_s))
         table = Table(box=None, pad_edge=False)
-        headings = list(_HEADINGS)
-        if not (has_slots := any(job.progress.slot for job in self._jobs)):
-            headings.remove(_WHERE)  # On one machine without GPUs.
-        for heading in headings:
+        # Without GPUs there are no slots; not all programs print steps, or what to rank them by.
+        kept = [n for n, column in enumerate(zip(*cells, strict=True)) if any(map(str, column))]
+        for heading in (_HEADINGS[number] for number in kept):
             name = heading.format(self._ranking.objective)
             is_long = heading in ("overrides", "state")
             width = 8 if is_long else None
             table.add_column(name, no_wrap=not is_long, min_width=width, overflow="fold")
-        rows = sorted(self._jobs, key=lambda job: _ORDER.index(job.progress.state))
-        names = _short_names(self._jobs)
-        for job in rows[:_MOST_ROWS]:
-            label = label_of({names[key]: value for key, value in job.overrides.items()})
-            table.add_row(*_row(job, job.progress, label, has_slots=has_slots))
+        for row in cells:
+            table.add_row(*(row[number] for number in kept))
         if len(rows) > _MOST_ROWS:
             table.add_row("", f"and {len(rows) - _MOST_ROWS} more")
         return table
@@ -118,24 +131,26 @@ def _short_names(jobs: Sequence[AnyJob]) -> dict[str, str]:
 
 
 def _row(
-    job: AnyJob, progress: Progress, label: str, *, has_slots: bool
+    job: AnyJob, progress: Progress, label: str, left_s: float | None
 ) -> tuple[str | Text, ...]:
     total, rate = job.num_timesteps, progress.env_steps_per_s
     part = min(progress.env_steps / total, 1.0) if total else None
-    left_s = max(0.0, total - progress.env_steps) / rate if rate and total else None
-    done = f" {progress.env_steps:,}" if part is None else f" {part:.0%}"
+    steps = f"{progress.env_steps:,}" if progress.env_steps else ""
+    done = steps if part is None else f" {part:.0%}"
     words = filter(None, (progress.error, progress.note))
-    is_silent = progress.state == "running" and total and not progress.env_steps
-    state = "starting" if is_silent else progress.state
+    is_running, state = progress.state == "running", progress.state
+    if is_running and progress.updated_s is None:
+        # Of a program that prints no steps it is not known whether it has begun.
+        state = f"{'starting' if total else 'running'} {clock(progress.wall_s)}"
     return (
         str(job.number),
         # As text: overrides and errors may look like markup.
         Text(label),
-        *((progress.slot,) if has_slots else ()),
-        Text(done.strip()) if part is None else Text.assemble(bar(part, _BAR_WIDTH), done),
+        progress.slot,
+        Text(done) if part is None else Text.assemble(bar(part, _BAR_WIDTH), done),
         f"{rate:,.0f}" if rate else "",
         "" if progress.latest is None else f"{progress.latest:.4g}",
         _ranked(progress),
-        "" if left_s is None else clock(left_s),
+        clock(left_s) if is_running and left_s is not None else "",
         Text(": ".join((state, *words))),
     )

@@ -47,11 +47,14 @@ def print_outcome(
     ranking: Ranking,
     paths: SweepPaths,
     line: str,
+    hint: str,
 ) -> None:
-    """Prints the tables of a `sweep.json`, a line about all jobs, and the files."""
+    """Prints the tables of a `sweep.json`, a hint, a line about all jobs, and the files."""
     for table in tables(report, ranking):
         console.print(table)
         console.print()
+    if hint:
+        console.print(hint)
     console.print(f"{line}\nsummary: {nearby(paths.sweep)}")
     console.print(f"tables: {nearby(paths.settings)}, {nearby(paths.table)}")
     if paths.curves.exists():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, NamedTuple, Self
@@ -133,6 +133,11 @@ class Work(ABC, Generic[J]):
     def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """What is to be said before the first job."""
         return ()
+
+    def hint(self, report: Mapping[str, Any]) -> str:
+        """A line after the tables of a report, or nothing."""
+        del report
+        return ""
 
     def grid_identity(self) -> dict[str, Any]:
         """What must be the same of the jobs' values."""

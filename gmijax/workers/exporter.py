@@ -30,7 +30,7 @@ def _run(link: ChildLink) -> None:
     from gmijax.deploy.trained import trained_policy
     from gmijax.sim.randomize import make_envs
 
-    link.beat("compiling", 0)
+    link.beat("running", 0)
     policy = trained_policy(checkpoint)
     # Only asked for names: nothing is simulated.
     env = make_envs(env_config, "jax", seed=0, first_env=0, num_envs=1)

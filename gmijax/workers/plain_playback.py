@@ -45,11 +45,15 @@ def _run(folder: Path, seconds: float) -> None:
     started_s = time.monotonic()
     episodes = together(list(_in_time(policy, config, seconds)), time.monotonic() - started_s)
     env_steps = policy.about.get("env_steps")
+    # What is played for so long only is the demo's film.
+    command = f"gmijax demo env={task}"
+    if math.isinf(seconds):
+        command = f"gmijax play env={task} checkpoint=shipped{config.film_overrides()}"
     trajectory = episodes.filmed(
         env.spec.control_dt_s,
         count=config.num_filmed,
         title=f"{task}, trained for {env_steps:,} env steps",
-        command=f"gmijax play env={task} checkpoint=shipped",
+        command=command,
     )
     save_model(paths.model, env.model)
     save_trajectory(paths.trajectory, trajectory)

@@ -131,11 +131,12 @@ def _write_trajectory(
     if env.mj_model is None:  # The controller sees that there is nothing to film.
         return
     save_model(paths.model, env.mj_model)
+    run = nearby(Path(str(config.run.dir)))
     trajectory = episodes.filmed(
         env.spec.control_dt_s,
         count=config.num_filmed,
         title=f"{env.spec.name} after {env_steps:,} env steps",
-        command=f"gmijax play run.dir={nearby(Path(str(config.run.dir)))} checkpoint={env_steps}",
+        command=f"gmijax play run.dir={run} checkpoint={env_steps}{config.film_overrides()}",
     )
     save_trajectory(paths.trajectory, trajectory)
 

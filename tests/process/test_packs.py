@@ -185,3 +185,15 @@ def test_a_pack_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert found.root == tmp_path / "all"
     assert [job["env_steps"] for job in found.report["jobs"]] == [4, 8]
     assert os.listdir(tmp_path) == ["all"]
+
+
+def test_without_a_reward_the_table_has_what_is_known_and_a_hint(tmp_path: Path) -> None:
+    line = ("x=1,2", "seed=0,1", "run.dir=p", "--", sys.executable, "-c", "print('{x} {seed}')")
+    done = train(*line, cwd=tmp_path, command="pack")
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    (heading,) = [number for number, text in enumerate(lines) if text.startswith("job  ")]
+    assert lines[heading].split() == ["job", "overrides", "time", "state"]
+    assert lines[heading + 1].split()[:3] == ["0", "x=1", "seed=0"]
+    assert not [text for text in lines if " - " in text or "metric -" in text]
+    assert "no reward was found in the output: pack.metric or pack.tag says where it is" in lines

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import random
+import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -197,4 +198,5 @@ def test_iterations_of_the_leader_are_traced_for_a_profile(how: str, tmp_path: P
     found = {e["args"]["step_num"] for e in events if e.get("name") == "iteration"}
     assert found == {"2", "3"}
     assert _read(run / "summary.json")["profile"]["iterations"] == [2, 3]
-    assert "profile of the iterations 2 to 3: run/profile\n" in done.stdout
+    trace = r"profile of iterations 2 to 3: run/profile/\S*/perfetto_trace\.json\.gz\n"
+    assert re.search(trace, done.stdout)

@@ -32,10 +32,19 @@ APART = "plan.serving_gpus, plan.training_gpus: GPUs [1] both act and train and 
 
 REFUSED: list[tuple[str, str, str]] = [
     # Keys and options that are not there.
-    ("train", "env=antt", "env=antt: unknown: did you mean ant?"),
-    ("train", "algo=td3", "algo=td3: unknown: allowed are a3c, distill, ppo, sac"),
+    ("train", "env=antt", "env=antt: unknown task: did you mean ant?"),
+    ("train", "algo=td3", "algo=td3: unknown algorithm: allowed are a3c, distill, ppo, sac"),
     ("train", "num_env=3", "unknown key num_env: did you mean num_envs?"),
     ("train", "algo.gamma=0.9", "unknown key algo.gamma: did you mean algo.discounting?"),
+    ("train", "algo.rate=1", "unknown key algo.rate: did you mean algo.learning_rate?"),
+    ("train", "run.checkpoint_interval=9", "_interval: did you mean run.checkpoint_every?"),
+    ("train", "hidden_sizes=[8]", "_sizes: did you mean algo.policy_hidden_layer_sizes?"),
+    ("train", "algo.num_layers=2", "_layers: did you mean algo.policy_hidden_layer_sizes?"),
+    ("train", "algo.zzz=2", "unknown key algo.zzz: see --help all"),
+    ("train", "ent=ant", "unknown key ent: did you mean env?"),
+    ("train", "--num-envs=64", "unknown option --num-envs=64: allowed are --help, --verbose, "),
+    ("train", "--num-envs=64", "; did you mean num_envs=64?"),
+    ("train", "seed=0,1", "(a list stands in brackets); gmijax sweep takes several"),
     ("train", "lr=1", "unknown key lr: did you mean algo.learning_rate?"),
     ("train", "total_timesteps=1", "unknown key total_timesteps: did you mean num_timesteps?"),
     (
@@ -57,6 +66,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "ant", "ant: expected key=value; did you mean env=ant?"),
     ("train", "humanod", "humanod: expected key=value; did you mean env=humanoid?"),
     ("train", "a3c", "a3c: expected key=value; did you mean algo=a3c?"),
+    ("train", "hepl", "hepl: expected key=value; did you mean --help?"),
     ("train", "mine.py:make", "did you mean env=mine.py:make?"),
     ("play", "last", "last: expected key=value; did you mean run.dir=last?"),
     ("train", "nothing-like-it", "nothing-like-it: expected key=value\n"),

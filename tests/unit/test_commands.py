@@ -11,8 +11,10 @@ import pytest
 
 from gmijax import demo
 from gmijax.__main__ import VERBS, main
+from gmijax.cli import help as cli_help
 from gmijax.config import PlayConfig, TrainConfig
 from gmijax.control import job
+from gmijax.control.console import training_of
 from gmijax.control.job import Result
 from gmijax.deploy import playing
 from gmijax.list_envs import task_of
@@ -84,13 +86,17 @@ def test_a_demo_with_keys_trains_plays_and_says_what_to_look_at(
     monkeypatch.setattr(demo, "show_shipped", lambda *_: None)
     assert main(["demo", "num_timesteps=42", "seed=3"]) == 0
     said = capsys.readouterr().out
-    assert f"return while it learnt: {run.returns_png}\n" in said
+    assert f"curve of the returns: {run.returns_png}\n" in said
     assert f"film: {played.mp4}\n" in said
 
 
-def test_an_unknown_verb_is_one_line_with_a_suggestion(capsys: pytest.CaptureFixture[str]):
-    assert main(["trian"]) == 2
-    assert capsys.readouterr().err == "gmijax: unknown command 'trian': did you mean train?\n"
+@pytest.mark.parametrize(("typed", "meant"), [("trian", "train"), ("hepl", "help")])
+def test_an_unknown_verb_is_one_line_with_a_suggestion(
+    typed: str, meant: str, capsys: pytest.CaptureFixture[str]
+):
+    assert main([typed]) == 2
+    said = capsys.readouterr().err
+    assert said == f"gmijax: unknown command {typed!r}: did you mean {meant}?\n"
 
 
 def test_version(capsys: pytest.CaptureFixture[str]):
@@ -125,11 +131,38 @@ def test_list_envs_names_tasks_and_suites(capsys: pytest.CaptureFixture[str]):
         assert name in said
 
 
+@pytest.mark.parametrize("is_there", [True, False])
+def test_help_marks_tasks_that_are_not_installed(
+    is_there: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    missing = {} if is_there else {"brax": "needs x", "go1": "needs y"}
+    monkeypatch.setattr(cli_help, "missing_of", missing.get)
+    assert main(["train", "--help"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert ("brax*, custom" in said, "go1*, go1_rough," in said) == (not is_there,) * 2
+    assert ("* not installed: gmijax list-envs prints what to install" in said) != is_there
+    assert main(["list-envs"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("num_gpus", "task", "command"),
+    [
+        (1, "ant", "gmijax train env=ant"),
+        (0, "ant", "gmijax train env=ball_balance"),
+        (0, "ball_balance", "gmijax train env=ball_balance"),
+    ],
+)
+def test_without_a_gpu_nobody_is_told_to_train_for_hours(num_gpus: int, task: str, command: str):
+    purpose, line = training_of(task, has_gpu=bool(num_gpus))
+    assert line == command
+    assert ("takes a GPU" in purpose) == (task not in command)
+
+
 @pytest.mark.parametrize(
     ("line", "answer"),
     [
-        ("gmijax tr", list(VERBS)),
-        ("gmijax ", list(VERBS)),
+        ("gmijax tr", [*VERBS, "help"]),
+        ("gmijax ", [*VERBS, "help"]),
         ("gmijax train env=an", ["env=ant", "env=anymal"]),
         ("gmijax train env=ant plan.gm", ["plan.gmis_per_gpu="]),
         ("gmijax play vid", ["video=", "video_envs="]),

@@ -9,8 +9,13 @@ from typing import Any
 import jax.numpy as jnp
 import pytest
 
-from gmijax.cli.compose import compose
-from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, ActorCriticConfig, TrainConfig
+from gmijax.cli.compose import build, compose
+from gmijax.config import (
+    ADAPTIVE_LEARNING_RATE_RANGE,
+    ActorCriticConfig,
+    PlayConfig,
+    TrainConfig,
+)
 from gmijax.config.schema import from_dict, to_dict
 from gmijax.errors import ConfigError
 from gmijax.learning.learner import adapted_learning_rate
@@ -102,3 +107,11 @@ def test_undecided_numbers_are_refused_where_numbers_are_needed():
     ):
         with pytest.raises(ConfigError, match="num_envs=auto: not decided yet"):
             _ = config.envs_per_gmi
+
+
+def test_a_film_names_the_keys_that_make_another_film_than_the_default():
+    assert not build("play", PlayConfig, ()).film_overrides()
+    other = ("num_envs=4", "seed=3", "deterministic=false", "camera=side", "width=320", "html=off")
+    assert build("play", PlayConfig, other).film_overrides() == (
+        " num_envs=4 seed=3 deterministic=false camera=side"
+    )

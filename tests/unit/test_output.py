@@ -17,11 +17,12 @@ from rich.text import Text
 from supervision import CHECKOUT, machine
 
 from gmijax.config import PlanConfig, ReduceConfig
-from gmijax.control import progress
+from gmijax.control import phases, progress, time_left
 from gmijax.control.console import Show, announce, doing, nearby, open_console, print_next
 from gmijax.control.display import LiveDisplay
 from gmijax.control.progress import ConsoleProgress
 from gmijax.control.summary import next_steps, train_outcome
+from gmijax.control.time_left import TimeLeft
 from gmijax.deploy import playing
 from gmijax.errors import printable
 from gmijax.partition.planner import make_plan
@@ -105,7 +106,7 @@ def test_a_job_tells_its_rate_and_return_or_of_its_channels(more: dict[str, Any]
 
 def test_a_job_tells_its_latest_evaluation():
     evaluated = {**SYNC, "eval/return": 9.5}
-    assert "return 7.25  eval 9.50  ETA" in _told([evaluated, SYNC])
+    assert _told([evaluated, SYNC]).endswith("return 7.25  eval 9.50")
     assert "eval" not in _told([SYNC])
 
 
@@ -184,7 +185,8 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     stopped = Clock()
-    monkeypatch.setattr(progress, "time", stopped)
+    for module in (phases, progress, time_left):
+        monkeypatch.setattr(module, "time", stopped)
     return stopped
 
 
@@ -231,6 +233,39 @@ def test_the_next_time_a_job_knows_how_long_it_compiles(
         f"{WHY}last time 0:42, longer now  1:40",
     ]
     assert CompileTime({"env": "ant", "num_envs": 128}).last_s is None
+
+
+def test_a_job_without_metrics_says_what_it_does_once_it_runs(
+    clock: Clock, compile_time: Callable[[], CompileTime]
+):
+    said, compiled = io.StringIO(), compile_time()
+    console = Console(file=said, width=300)
+    with ConsoleProgress(console, list, 0, compiled, "playing 16 episodes") as shown:
+        for state in ("starting", "compiling", "running", "running"):
+            shown.update(_status(state))
+            clock.now_s += 20
+    assert said.getvalue().splitlines() == [
+        "starting: loading JAX, building the environments  0:00",
+        f"{WHY}usually 1 to 3 minutes  0:00",
+        "compiled in 0:20",
+        "playing 16 episodes  0:00",
+    ]
+    assert compile_time().last_s == 20
+
+
+def test_an_eta_goes_by_the_latest_iterations_and_not_by_the_first(clock: Clock):
+    left, told = TimeLeft(), []
+    for seconds, steps in ((0, 10), (9, 20), (1, 20), (1, 30), (1, 130), (9, 1030), (60, 7030)):
+        clock.now_s += seconds
+        left.note(steps)
+        told.append(left.seconds(10_000))
+    assert told[:4] == [None] * 4  # Reports are too few; what is noted twice is one.
+    assert told[4:] == pytest.approx([987.0, 8970 / (1020 / 21), 2970 / (7000 / 70)], rel=0.1)
+    clock.now_s += 10
+    assert left.seconds(10_000) == pytest.approx((told[-1] or 0) - 10)
+    assert left.seconds(7030) is None
+    left.note(0)  # Started again.
+    assert left.seconds(10_000) is None
 
 
 def test_broken_notes_of_compile_times_are_no_error(
@@ -334,7 +369,7 @@ def test_an_evaluation_says_whether_it_was_with_noise(
 @pytest.mark.parametrize(
     ("iterations", "error", "line"),
     [
-        ((20, 25), None, "profile of the iterations 20 to 25: profile"),
+        ((20, 25), None, "profile of iterations 20 to 25: profile/a/perfetto_trace.json.gz"),
         (None, None, "profile: none, the command ended before the first iteration of run.profile"),
         ((20, 22), "disk full", "profile: the trace could not be written: disk full"),
     ],
@@ -348,6 +383,8 @@ def test_a_run_says_what_became_of_its_profile(
 ):
     monkeypatch.chdir(tmp_path)
     run = RunPaths(tmp_path)
+    (run.profile / "a").mkdir(parents=True)
+    (run.profile / "a" / "perfetto_trace.json.gz").touch()
     profile = {"iterations": iterations, "dir": str(run.profile), "error": error}
     assert line in train_outcome({**SUMMARY, "profile": profile}, run).splitlines()
 

@@ -12,6 +12,7 @@ from rich.console import Console
 from supervision import save_meta
 
 from gmijax.cli.command import command
+from gmijax.cli.compose import compose
 from gmijax.config import EnvConfig, PlayConfig
 from gmijax.config.schema import to_dict
 from gmijax.deploy import pictures, playing, trained_run
@@ -22,6 +23,7 @@ from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.player.joystick import ROBOTS
 from gmijax.runs.folder import EXIT_NO_GL, META, PlayPaths, RunPaths, write_json
+from gmijax.runs.held import locked
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.start_gmi import environment_of
 
@@ -117,6 +119,20 @@ def test_a_checkpoint_that_cannot_be_meant_is_bad_input(
     config = config_of(*(text.format(run=run.root, other=other) for text in overrides))
     with pytest.raises(ConfigError, match=message):
         checkpoint_of(config)
+
+
+def test_the_last_run_is_not_mistaken_for_one_that_is_training(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    new = RunPaths(run.root.parent / "new")
+    new.root.mkdir()
+    for paths in (run, new):
+        write_json(paths.config, to_dict(compose("env=ant")))
+    monkeypatch.chdir(run.root.parents[1])
+    with locked(new.lock, "new"):
+        assert "runs/new: still training, no checkpoint yet" in str(open_run(config_of())[2])
+        assert open_run(config_of(f"run.dir={run.root}"))[2] is None
+    assert open_run(config_of())[2] is None
 
 
 def test_envs_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytest.MonkeyPatch):

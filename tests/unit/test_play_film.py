@@ -28,6 +28,20 @@ def test_films_play_in_real_time(control_dt_s: float, max_fps: float, stride: in
 
 
 @pytest.mark.parametrize(
+    ("picture_s", "fps", "length_s"),
+    [(0.001, 15.0, 6.0), (0.035, 15.0, 3.33), (0.05, 12.5, 3.0), (0.5, 12.5, 3.0)],
+)
+def test_a_brief_film_is_shortened_before_it_stutters(
+    picture_s: float, fps: float, length_s: float, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(play_film, "_picture_s", lambda *_: picture_s)
+    whole = Trajectory(np.zeros((1001, 4, 1)), np.full(4, 1000), 0.01, (), ())
+    brief, max_fps = play_film.brief(whole, PaintedStage(), 7.0)
+    assert max_fps == pytest.approx(fps)
+    assert 0.01 * (len(brief.qpos) - 1) == pytest.approx(length_s, abs=0.011)
+
+
+@pytest.mark.parametrize(
     ("num_tiles", "grid"), [(1, (1, 1)), (2, (2, 1)), (3, (2, 2)), (5, (3, 2)), (9, (3, 3))]
 )
 def test_grid_is_as_square_as_possible(num_tiles: int, grid: tuple[int, int]):

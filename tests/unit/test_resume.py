@@ -15,14 +15,16 @@ from supervision import save
 from gmijax.cli.compose import compose
 from gmijax.config import PpoConfig
 from gmijax.config.schema import to_dict
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, NoCheckpointYet
 from gmijax.runs.folder import META, RunPaths, read_json, write_json
+from gmijax.runs.held import locked
 from gmijax.runs.resume import (
     CheckpointMeta,
     file_check,
     find_checkpoint,
     last_run,
     newest_checkpoint,
+    unsaved_runs,
 )
 from gmijax.runs.saved_config import left_out, trained_config
 
@@ -40,6 +42,31 @@ def make_run(root: Path, *env_steps: int) -> RunPaths:
 @pytest.fixture
 def run(tmp_path: Path) -> RunPaths:
     return make_run(tmp_path / "runs" / "x", 100, 2000)
+
+
+@pytest.mark.parametrize(
+    ("every", "when"),
+    [(50, "after 50 iterations (run.checkpoint_every)"), (0, "when it ends")],
+)
+def test_a_run_that_trains_has_its_first_checkpoint_still_to_come(
+    every: int, when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    run = make_run(Path("runs") / "new")
+    config = read_json(run.config)
+    write_json(run.config, {**config, "run": {**config["run"], "checkpoint_every": every}})
+    later = f"still training, no checkpoint yet; the first is saved {when}"
+    with locked(run.lock, "new"):
+        for named, said in (("last", "run.dir=last: runs/new: "), ("runs/new", "=runs/new: ")):
+            with pytest.raises(NoCheckpointYet, match=re.escape(f"{said}{later}")):
+                find_checkpoint(named, "run.dir")
+        make_run(Path("runs") / "old", 100)
+        assert last_run("run.dir").name == "old"
+        assert unsaved_runs() == [Path("runs") / "new"]
+    # It has ended without one.
+    assert unsaved_runs() == []
+    with pytest.raises(ConfigError, match="no checkpoint in this folder"):
+        find_checkpoint("runs/new", "run.dir")
 
 
 def test_last_is_the_run_with_the_newest_checkpoint(
@@ -219,3 +246,10 @@ def test_a_leaf_that_the_run_did_not_randomize_stays_as_it_is(run: RunPaths):
     config = compose(f"run.resume={run.root}", "env.randomization.body_mass.range=[0.5,1.5]")
     assert set(config.env.randomization) == set(saved["env"]["randomization"])
     assert config.env.randomization["body_mass"].range == (0.5, 1.5)
+
+
+def test_a_misspelt_run_folder_is_answered_with_the_one_beside_it(tmp_path: Path):
+    make_run(tmp_path / "tiny", 100)
+    for name, said in (("tinny", r"no such folder; did you mean .*tiny\?$"), ("x" * 9, "folder$")):
+        with pytest.raises(ConfigError, match=said):
+            find_checkpoint(str(tmp_path / name), "run.dir")

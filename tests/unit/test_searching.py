@@ -99,9 +99,11 @@ def test_a_second_search_profiles_nothing(profiles: Use, monkeypatch: pytest.Mon
     }
     assert (report["complete"], report["num_profiled"]) == (True, 4)
     assert (result.run_dir / "search.png").stat().st_size > 1000
+    compiles = "every profile is a short job of its own, which compiles its programs first; "
+    assert said.count(compiles) == 1
     again = profiles(scaling)
-    second, _ = found()
-    assert again.asked == []
+    second, said = found()
+    assert (again.asked, said.count(compiles)) == ([], 0)
     assert second[1:5] == result[1:5]
     assert second.run_dir is None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -194,8 +195,10 @@ def test_the_demo_plays_and_says_what_it_is(
     said = capsys.readouterr().out
     assert said.startswith("ball_balance: a policy that gmijax trained for 1,000 env steps\n")
     assert "episodes in MuJoCo: return " in said
-    assert "gmijax play env=ball_balance checkpoint=shipped\n" in said
-    assert said.endswith("gmijax train env=ball_balance\n")
+    assert re.search(r"  gmijax (play|view) env=ball_balance checkpoint=shipped\n", said)
+    assert said.endswith("Next: train ball_balance yourself\n  gmijax train env=ball_balance\n")
+    trajectory = load_trajectory(Path("runs/shipped/ball_balance/trajectory.npz"))
+    assert trajectory.lines[-1] == "$ gmijax demo env=ball_balance"
     assert shown == [demo.FILM_S]
     assert not list(Path.cwd().glob("runs/shipped/*/model.mjb"))
 

@@ -74,15 +74,43 @@ def test_the_table_says_of_each_job_where_and_how_far_it_is() -> None:
     with view_on(terminal, running_jobs()) as view:
         view.update()
         shown = terminal.getvalue()
-    lines = [printable(line).split() for line in shown.splitlines()]
-    rows = {words[0]: " ".join(words) for words in reversed(lines) if words}
-    assert "overrides GPU and slot progress steps/s return ranked by ETA state" in rows["job"]
-    assert rows["0"].endswith("50% 50 2.5 3.5 0:10 running")
+    rows = rows_of(shown)
+    assert rows["job"] == "job overrides GPU and slot progress steps/s return ranked by state"
+    assert rows["0"].endswith("50% 50 2.5 3.5 running")
     assert "seed=0 GPU 3 slot 0" in rows["0"]
-    assert rows["1"].endswith("25% 50 2.5 3.5 0:15 running")
+    assert rows["1"].endswith("25% 50 2.5 3.5 running")
     assert rows["2"].endswith("100% 2.5 3.5 completed")
     assert "waiting: again, alone on its GPU, after CUDA_ERROR_[/x]" in rows["3"]
     assert "2 running, 1 waiting, 1 completed; 100 steps/s, 2.0 runs/h" in shown
+
+
+def rows_of(shown: str) -> dict[str, str]:
+    """Rows of the last table by their first words."""
+    table = shown[shown.rindex("job ") :]
+    lines = [printable(line).split() for line in table.splitlines()]
+    return {words[0]: " ".join(words) for words in reversed(lines) if words}
+
+
+def test_a_job_shows_how_long_it_starts_and_an_eta_once_its_rate_is_steady(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(display, "REFRESH_S", 0.0)
+    terminal, now_s = Terminal(), [1000.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    (job,) = jobs_of([compose("num_timesteps=1000")])
+    shown = []
+    with view_on(terminal, [job]) as view:
+        job.progress.begin("", None)
+        for seconds, steps in ((42, 0), (1, 100), (20, 110), (2, 210), (2, 310), (2, 410)):
+            now_s[0] += seconds
+            if steps:
+                job.progress.report({"env_steps": steps, "env_steps_per_s": 50.0}, SWEEP)
+            view.update()
+            shown.append(rows_of(terminal.getvalue())["0"])
+    assert shown[0].endswith(" 0% starting 0:42")
+    assert [row.split()[-2:] for row in shown[1:4]] == [["50", "running"]] * 3
+    # 210 steps in 24 s, and 590 are left; by the rate of the last report it would be 0:12.
+    assert [row.split()[-2] for row in shown[4:]] == ["1:19", "0:49"]
 
 
 def test_without_a_terminal_every_change_is_a_line() -> None:

@@ -87,7 +87,7 @@ def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
         (("sweep.gpus=[]",), "expected a number of GPUs or distinct indices"),
         (("seed=0,1", "algo.learnin_rate=1"), "unknown key algo.learnin_rate"),
         (("seed=0,x",), "seed"),
-        (("env=ant,nobody",), "env=nobody: unknown"),
+        (("env=ant,nobody",), "env=nobody: unknown task"),
         (("sweep.sampler=tpe", "seed=0,1"), "needs sweep.trials"),
         (("sweep.trials=3", "seed=0,1"), "sweep.sampler=grid runs all of them"),
         (("sweep.pruner=asha", "seed=0,1"), "not with sweep.sampler=grid"),
@@ -176,6 +176,15 @@ def test_returns_of_different_rewards_are_warned_of(
     assert (said is not None) == warns
     if said:
         assert said.startswith(f"warning: sweep.objective={objective}: jobs differ in env.rewards")
+
+
+def test_a_sweep_says_that_its_jobs_compile_first_unless_all_have_run() -> None:
+    work = build_sweep(("seed=0,1",))
+    (line,) = work.warnings(())
+    assert line.startswith("the first job of each task and size compiles its programs, ")
+    for job in work.jobs:
+        job.progress.state = "completed"
+    assert not work.warnings(())
 
 
 def gpu_slots(gpus: int, jobs_per_gpu: int) -> SlotPool:
@@ -427,6 +436,14 @@ def test_the_ranking_has_full_windows_first_and_jobs_without_a_value_below(
     assert [job["window_full"] for job in report["jobs"][:3]] == [True, False, True]
 
 
+def test_without_anything_to_rank_by_there_is_one_table_of_what_is_known(tmp_path: Path) -> None:
+    jobs = ended(("algo.entropy_cost=1,2", "seed=0,1"), [(None, 0, False)] * 4)
+    for job in jobs:
+        job.progress.env_steps, job.progress.earlier_s = 0, 61.0
+    [rows] = shown_tables(tmp_path, jobs, SweepConfig(objective="return"))
+    assert rows[0] == ["0", "algo.entropy_cost=1 seed=0", "1:01", "completed"]
+
+
 def test_settings_come_first_with_the_interquartile_mean_of_their_seeds(tmp_path: Path) -> None:
     values = (10.0, 11.0, 12.0, 90.0), (20.0, 21.0, 22.0, 23.0), (50.0, 50.0, None, 50.0)
     windows = [(v, 200, own != values[2] or seed) for own in values for seed, v in enumerate(own)]
@@ -501,6 +518,7 @@ def test_jobs_at_a_time_by_profiling(
     profiled: list[int],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     done: list[int] = []
@@ -515,10 +533,11 @@ def test_jobs_at_a_time_by_profiling(
     hosts = [LocalHost(machine(1, mps_control=Path("/usr/bin/nvidia-cuda-mps-control")))]
     for _ in range(2):  # The second time by the store.
         found = with_jobs_per_gpu(
-            SweepConfig(), jobs, hosts, open_console(show=False), StopSignals()
+            SweepConfig(), jobs, hosts, open_console(show=True), StopSignals()
         )
         assert found.jobs_per_gpu == best
     assert done == profiled
+    assert capsys.readouterr().out.count("they compile first") == len(profiled)
     done.clear()  # Larger jobs are others.
     large = jobs_of([compose(f"seed={n}", "plan.gmis_per_gpu=2") for n in range(num_jobs)])
     with_jobs_per_gpu(SweepConfig(), large, hosts, open_console(show=False), StopSignals())
