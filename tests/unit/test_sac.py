@@ -357,15 +357,13 @@ def test_the_policy_learns_once_after_so_many_updates(
     made: list[str] = []
 
     def counted(name: str) -> Any:
-        def note(state: Any) -> Any:
-            jax.debug.callback(lambda: made.append(name), ordered=False)
-            return state
-
         inner = getattr(sac, name)
 
         def update(*args: Any) -> Any:
-            state, figures = inner(*args)
-            return note(state), figures
+            # No cache takes a program with callbacks, and with real updates it is a large one.
+            _, figures = jax.eval_shape(lambda: inner(*args))
+            jax.debug.callback(lambda: made.append(name), ordered=False)
+            return args[3], jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), figures)
 
         return update
 
