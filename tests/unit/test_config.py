@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+from contextlib import suppress
 from typing import Any
 
 import jax.numpy as jnp
 import pytest
+from hydra.core.config_store import ConfigStore
 
 from gmijax.cli.compose import compose
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, ActorCriticConfig, TrainConfig
@@ -102,3 +104,14 @@ def test_undecided_numbers_are_refused_where_numbers_are_needed():
     ):
         with pytest.raises(ConfigError, match="num_envs=auto: not decided yet"):
             _ = config.envs_per_gmi
+
+
+@pytest.mark.parametrize("override", ["num_envs=3", "num_envs=3.5x", "no_key=1"])
+def test_jobs_of_hydra_in_the_same_process_keep_their_settings(override: str):
+    def settings() -> list[Any]:
+        return list(ConfigStore.instance().load("hydra/config.yaml").node.defaults)
+
+    before = settings()
+    with suppress(ConfigError):
+        compose(override)
+    assert settings() == before != []
