@@ -19,8 +19,9 @@ PLAN := $(if $(filter 1,$(GPUS)),plan.gpus=1 plan.gmis_per_gpu=2,plan.gpus=2 pla
 # A million steps: six minutes on two cores, with the making of the environment.
 TRAIN_ARGS ?= env=ball_balance $(PLAN) num_timesteps=1000000
 TEST_ARGS ?=
-# The tests of a file share what they compile. In order of folders: long ones, of processes, come before the units.
-TEST_WORKERS ?= -n 2 --dist loadfile --no-loadscope-reorder
+# One worker more than cores: those of processes wait for a quarter of their time. The tests of a file share what they
+# compile. In order of folders: long ones, of processes, come before the units.
+TEST_WORKERS ?= -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder
 SOAK_MINUTES ?= 60
 
 # Tests start hundreds of processes. Without bytecode each of them compiles what it imports again: seconds.

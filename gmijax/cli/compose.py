@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import re
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, Literal, TypeVar, overload
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
+from hydra.conf import HydraConf
+from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gmijax.cli.arguments import parse, readable, require_text
@@ -156,7 +161,7 @@ def compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     if chosen.get("env") in ("custom", "playground"):
         overrides = [f"++{text}" if text.startswith(NAMED_BY_TASK) else text for text in overrides]
     try:
-        with initialize_config_dir(str(config_dir()), version_base=None):
+        with _no_jobs_of_hydra(), initialize_config_dir(str(config_dir()), version_base=None):
             config = hydra_compose(name, overrides=list(overrides))
         data = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except (ValueError, HydraException, OmegaConfBaseException) as error:
@@ -169,6 +174,26 @@ def compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
         # Its configurations have groups, whose names stand in ours with dots.
         composed["env"]["settings"] = flatten(composed["env"]["settings"])
     return composed
+
+
+@functools.cache
+def _bare() -> DictConfig:
+    return OmegaConf.structured(HydraConf(defaults=[]))
+
+
+@contextmanager
+def _no_jobs_of_hydra() -> Iterator[None]:
+    """Leaves out Hydra's settings of jobs that it runs itself, half of what it would compose.
+
+    The store is restored: it belongs to the process, in which the user may have jobs of Hydra.
+    """
+    stored = ConfigStore.instance().repo["hydra"]
+    whole = stored["config.yaml"]
+    stored["config.yaml"] = dataclasses.replace(whole, node=_bare())
+    try:
+        yield
+    finally:
+        stored["config.yaml"] = whole
 
 
 def _check_override(name: str, item: Override) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,10 @@ SAC = (
     *("algo=sac", "algo.batch_size=32", "algo.updates_per_step=1"),
     *("algo.critic_hidden_layer_sizes=[16]", "algo.num_atoms=11", "algo.replay_steps=16"),
     "algo.learning_starts=4",
+)
+SAVING = (
+    *(*BASE, *SAC, "plan.gpus=2", "run.checkpoint_every=2", "algo.save_replay=true"),
+    *("algo.replay_precision=float16", "algo.n_step=2"),
 )
 
 
@@ -45,55 +50,72 @@ def test_a_student_keeps_its_teacher_and_goes_on(tmp_path: Path) -> None:
     assert "algo.teacher=runs/nobody: no such folder" in done.stderr
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two GMIs that have learnt by SAC without a stop; the last checkpoint has their replays."""
+    cwd = tmp_path_factory.mktemp("sac")
+    done = train(*SAVING, "run.dir=whole", "num_timesteps=1024", cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    assert "the replay of" not in done.stdout
+    check_replays(cwd / "whole")
+    return cwd / "whole"
+
+
+def check_replays(run: Path) -> None:
+    checkpoints = sorted((run / "checkpoints").iterdir())
+    assert len(checkpoints) > 2
+    replays = [path.name for one in checkpoints for path in one.glob("replay_*")]
+    # Those of the end alone, also where another one came before.
+    assert sorted(replays) == ["replay_0", "replay_1"]
+    assert len(list(checkpoints[-1].glob("replay_*"))) == 2
+    assert all(what_is_broken(one) is None for one in checkpoints)
+
+
+def metrics_of(run: Path) -> list[dict[str, Any]]:
+    return [json.loads(text) for text in (run / "metrics.jsonl").read_text().splitlines()]
+
+
 @pytest.mark.timeout(300)
-def test_two_gmis_learn_by_sac_and_fill_the_replay_anew_when_they_go_on(tmp_path: Path) -> None:
-    line = ("plan.gpus=2", "run.checkpoint_every=3", "num_timesteps=1024")
-    done = train(*BASE, *SAC, *line, "run.dir=run", cwd=tmp_path)
+def test_two_gmis_learn_by_sac_and_fill_the_replay_anew_when_they_go_on(whole: Path) -> None:
+    half, plain = sorted((whole / "checkpoints").iterdir())[0], whole.parent / "plain"
+    # What is not in a checkpoint may be kept otherwise from there on.
+    other = ("algo.save_replay=false", "algo.replay_precision=float32", "algo.n_step=1")
+    done = train(f"run.resume={half}", *other, "run.dir=plain", cwd=whole.parent)
     assert done.returncode == 0, done.stderr
-    half = sorted((tmp_path / "run" / "checkpoints").iterdir())[0]
-    done = train(f"run.resume={half}", "run.dir=again", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "the replay of 384 transitions is not in the checkpoint" in done.stdout
-    for run, first in (("run", 4.0), ("again", 4.0)):
-        lines = [
-            json.loads(x) for x in (tmp_path / run / "metrics.jsonl").read_text().splitlines()
-        ]
+    assert "the replay of 256 transitions is not in the checkpoint" in done.stdout
+    for run, first in ((whole, 0), (plain, 2)):
+        lines = metrics_of(run)
         assert lines[-1]["env_steps"] == 1024
         assert lines[-1]["loss/critic_loss"] > 0
-        own = lines if run == "run" else lines[3:]
-        assert own[0]["replay/steps"] == first
+        assert lines[first]["replay/steps"] == 4.0
+    assert not list(plain.glob("checkpoints/*/replay_*"))
 
 
 @pytest.mark.timeout(300)
-def test_a_replay_that_is_saved_goes_on_with_its_run(tmp_path: Path) -> None:
-    saved = ("algo.save_replay=true", "algo.replay_precision=float16", "algo.n_step=2")
-    line = (*BASE, *SAC, *saved, "plan.gpus=2", "run.checkpoint_every=2")
-    for run, first, last in (("whole", None, 1024), ("again", None, 640), ("again", 640, 1024)):
-        auto = () if first is None else ("run.resume=auto",)
-        done = train(*line, *auto, f"run.dir={run}", f"num_timesteps={last}", cwd=tmp_path)
+def test_a_replay_that_is_saved_goes_on_with_its_run(whole: Path) -> None:
+    cwd = whole.parent
+    for auto, last in (((), 640), (("run.resume=auto",), 1024)):
+        done = train(*SAVING, *auto, "run.dir=again", f"num_timesteps={last}", cwd=cwd)
         assert done.returncode == 0, done.stderr
         assert "the replay of" not in done.stdout
-        checkpoints = sorted((tmp_path / run / "checkpoints").iterdir())
-        assert len(checkpoints) > 2
-        replays = [path.name for one in checkpoints for path in one.glob("replay_*")]
-        # Those of the end alone, also where another one came before.
-        assert sorted(replays) == ["replay_0", "replay_1"]
-        assert len(list(checkpoints[-1].glob("replay_*"))) == 2
-        assert all(what_is_broken(one) is None for one in checkpoints)
-    again, whole = (learner_arrays(tmp_path / run) for run in ("again", "whole"))
-    for array, other in zip(again, whole, strict=True):
+        check_replays(cwd / "again")
+    again = learner_arrays(cwd / "again")
+    for array, other in zip(again, learner_arrays(whole), strict=True):
         np.testing.assert_array_equal(array, other)
-    half = checkpoints[-1]
-    # What does not fit it is refused; so is one that is larger than the memory.
-    resumed, most = (f"run.resume={half}", "run.dir=bad"), 16_000_000_000
-    longer = "num_timesteps=2048"
+
+
+@pytest.mark.timeout(300)
+def test_a_replay_that_does_not_fit_is_refused(whole: Path) -> None:
+    """Another one than the checkpoint's, and one that is larger than the memory."""
+    saved, most = sorted((whole / "checkpoints").iterdir())[-1], 16_000_000_000
+    resumed = (f"run.resume={saved}", "run.dir=bad", "num_timesteps=2048")
     for line, said in (
         (
-            (*resumed, longer, "algo.replay_steps=32"),
+            (*resumed, "algo.replay_steps=32"),
             "algo.replay_steps=32: the replay in the checkpoint",
         ),
         (
-            (*resumed, longer, "algo.replay_precision=float32"),
+            (*resumed, "algo.replay_precision=float32"),
             "algo.replay_precision=float32: the replay",
         ),
         (
@@ -101,8 +123,8 @@ def test_a_replay_that_is_saved_goes_on_with_its_run(tmp_path: Path) -> None:
             f"{most} steps of each (algo.",
         ),
     ):
-        done = train(*line, cwd=tmp_path)
+        done = train(*line, cwd=whole.parent)
         assert done.returncode == 2
         assert said in done.stderr
         assert len(done.stderr.splitlines()) == 1
-    assert not (tmp_path / "bad").exists()
+    assert not (whole.parent / "bad").exists()

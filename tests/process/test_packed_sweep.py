@@ -15,6 +15,9 @@ from gmijax.learning.episode_window import WINDOW_EPISODES
 from gmijax.runs.history import read_metrics
 from gmijax.runs.resume import newest_checkpoint
 
+ITERATIONS = 500
+"""Of jobs that are killed and stopped before their end."""
+
 SWEEP = (*POINT, "sweep.pack=vmap", "sweep.jobs_per_gpu=4", "run.dir=all")
 
 
@@ -65,7 +68,8 @@ def test_jobs_in_one_program_do_as_alone_and_fail_alone(tmp_path: Path) -> None:
 @pytest.mark.timeout(400)
 def test_after_a_kill_and_a_stop_all_jobs_of_a_program_go_on(tmp_path: Path) -> None:
     # The first one diverges at once.
-    command = (*SWEEP, "seed=0,1", "algo.learning_rate=1e30,3e-4", f"num_timesteps={1000 * STEPS}")
+    command = (*SWEEP, "seed=0,1", "algo.learning_rate=1e30,3e-4")
+    command = (*command, f"num_timesteps={ITERATIONS * STEPS}")
     command = (*command, "algo.learning_rate_schedule=fixed", "run.checkpoint_every=20")
     command = (*command, "run.max_restarts=2")
     runs = [tmp_path / "all" / name for name in ("001", "003")]
@@ -98,5 +102,5 @@ def test_after_a_kill_and_a_stop_all_jobs_of_a_program_go_on(tmp_path: Path) -> 
         summary = json.loads((run / "summary.json").read_text())
         assert summary["status"] == "completed"
         assert [line["env_steps"] for line in lines(run)] == [
-            STEPS * (number + 1) for number in range(1000)
+            STEPS * (number + 1) for number in range(ITERATIONS)
         ]

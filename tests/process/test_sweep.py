@@ -86,7 +86,7 @@ def test_a_sweep_that_is_killed_goes_on_and_a_job_fails_alone(tmp_path: Path) ->
 def test_a_job_whose_controller_is_killed_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     # The second one is interrupted as if by somebody who takes it for a run of its own.
     signals = (signal.SIGKILL, signal.SIGTERM)
-    command = (*POINT, f"num_timesteps={2000 * STEPS}", "run.checkpoint_every=20", "seed=0,1")
+    command = (*POINT, f"num_timesteps={1000 * STEPS}", "run.checkpoint_every=100", "seed=0,1")
     sweep = start(
         *command,
         *("run.max_restarts=2", "sweep.jobs_per_gpu=2", "run.dir=all"),

@@ -45,14 +45,15 @@ SAME = ("algo.num_minibatches=1", "algo.num_updates_per_batch=3", f"num_timestep
 
 @pytest.fixture(scope="module")
 def two_gmis(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six iterations of two GMIs."""
+    """Six iterations of two GMIs, of which two are traced."""
     cwd = tmp_path_factory.mktemp("two")
     done = train(
-        *POINT, *SAME, "plan.gmis_per_gpu=2", "run.dir=run",
+        *POINT, *SAME, "plan.gmis_per_gpu=2", "run.dir=run", "run.profile=2:3",
         "run.measure_throughput=true", "run.checkpoint_every=3", "-v", cwd=cwd,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "strategy mpr" in done.stdout
+    assert re.search(PROFILED, done.stdout)
     return cwd / "run"
 
 
@@ -186,17 +187,26 @@ def test_kills_at_any_moment_leave_nothing(plan: tuple[str, ...], tmp_path: Path
     require_gone(mps_directories, pipes)
 
 
+PROFILED = r"profile of iterations 2 to 3: run/profile/\S*/perfetto_trace\.json\.gz\n"
+
+
+def test_iterations_of_the_leader_are_traced_for_a_profile(two_gmis: Path) -> None:
+    check_profile(two_gmis)
+
+
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("how", ["plan.gmis_per_gpu=2", "algo=a3c"])
-def test_iterations_of_the_leader_are_traced_for_a_profile(how: str, tmp_path: Path) -> None:
+def test_iterations_of_a_trainer_are_traced_for_a_profile(tmp_path: Path) -> None:
     steps = f"num_timesteps={12 * 2 * STEPS}"
-    done = train(*POINT, how, steps, "run.profile=2:3", "run.dir=run", cwd=tmp_path)
+    done = train(*POINT, "algo=a3c", steps, "run.profile=2:3", "run.dir=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    run = tmp_path / "run"
+    assert re.search(PROFILED, done.stdout)
+    check_profile(tmp_path / "run")
+
+
+def check_profile(run: Path) -> None:
+    """The iterations that were asked for are in the trace, and no others."""
     [path] = run.glob("profile/plugins/profile/*/perfetto_trace.json.gz")
     events = json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
     found = {e["args"]["step_num"] for e in events if e.get("name") == "iteration"}
     assert found == {"2", "3"}
     assert _read(run / "summary.json")["profile"]["iterations"] == [2, 3]
-    trace = r"profile of iterations 2 to 3: run/profile/\S*/perfetto_trace\.json\.gz\n"
-    assert re.search(trace, done.stdout)

@@ -222,8 +222,16 @@ def test_what_an_extra_brings_is_named(python: Path, trained: Path):
 
 def test_commands_without_a_job_say_what_they_know(python: Path, tmp_path: Path):
     assert "ball_balance" in gmijax(python, "list-envs", cwd=tmp_path)
-    for verb in ("train", "search", "sweep", "serve", "play", "export"):
-        assert "run.dir" in gmijax(python, verb, "--help", cwd=tmp_path)
+    verbs = ("train", "search", "sweep", "serve", "play", "export")
+    code = f"""
+from gmijax.__main__ import main
+for verb in {verbs}:
+    print(verb, main([verb, "--help"]), sep=": ")
+"""
+    helps = run([python, "-c", code], tmp_path)
+    for verb in verbs:
+        text, helps = helps.split(f"{verb}: 0\n")
+        assert "run.dir" in text
 
 
 @pytest.mark.slow

@@ -104,6 +104,7 @@ def test_newer_weights_are_taken_up_within_an_unroll(tmp_path) -> None:
     Agent(config, ENV, 0, (0,), registers, sender, link).run()
     assert [version for _, version in sender.taken] == [3, 3, 4]
 
+    @jax.jit
     def told(experience, theirs):
         obs = normalize(theirs.moments, experience["state"])
         networks, params = learner.networks, theirs.params

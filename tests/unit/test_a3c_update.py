@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from axis_collectives import run_together
-from jax.flatten_util import ravel_pytree
 from toy_env import point_mass
 
 from gmijax.a3c.a3c import A3cLosses, gradients, update
@@ -174,23 +174,24 @@ def test_the_entropy_of_stale_unrolls_teaches_nothing(config, changes) -> None:
     batch = _unrolled(learner, state, envs)[1]
     stale = N // 2
     weight = jnp.asarray([2.0] * (N - stale) + [0.0] * stale)
-    targets = batch_targets(learner, state, batch, weight)
-
-    def learnt(batch):
-        return gradients(learner, state.params, batch, targets, jnp.arange(N))
-
-    moved = batch._replace(state=batch.state.at[:, -stale:].add(1.0))
-    (first, losses), (second, others) = learnt(batch), learnt(moved)
+    targets = jax.jit(partial(batch_targets, learner))(state, batch, weight)
+    learnt = jax.jit(partial(gradients, learner))
+    states = np.array(batch.state)
+    states[:, -stale:] += 1.0
+    (first, losses), (second, others) = (
+        learnt(state.params, one, targets, np.arange(N))
+        for one in (batch, batch._replace(state=jnp.asarray(states)))
+    )
     jax.tree.map(np.testing.assert_array_equal, first, second)
     assert losses.entropy == others.entropy
     # What is fresh counts as it would alone.
-    fresh = gradients(learner, state.params, batch, targets, jnp.arange(N - stale))[1]
-    np.testing.assert_allclose(fresh.entropy, 2.0 * losses.entropy, rtol=1e-5)
+    fresh = learnt(state.params, batch, targets, np.arange(N - stale))[1]
+    np.testing.assert_allclose(fresh.entropy, 2.0 * float(losses.entropy), rtol=1e-5)
 
 
 def _together(learner, state, both, weight):
     """The update of two trainers that have half of the batch each."""
-    halves = jax.tree.map(lambda x: jnp.stack(jnp.split(x, 2, axis=1)), both)
+    halves = jax.tree.map(lambda x: np.stack(np.split(np.asarray(x), 2, axis=1)), both)
     step = partial(update, learner)
     return run_together(step, (), state, (halves, weight.reshape(2, N)))
 
@@ -201,12 +202,13 @@ def test_two_trainers_stay_equal_and_weigh_fresh_unrolls_alike(config) -> None:
         config, num_minibatches=1, num_updates_per_batch=1, normalize_advantage=False
     )
     learner, state, envs = _start(plain, num_envs=2 * N)
-    _, both, _ = _unrolled(learner, state, envs)
+    both = jax.device_get(_unrolled(learner, state, envs)[1])
     # One trainer has a fresh unroll and stale ones, the other fresh ones only.
     fresh = np.array([1.0] + [0.0] * (N - 1) + [1.0] * N, np.float32)
-    weight = jnp.asarray(fresh * len(fresh) / fresh.sum())
-    alone, said = _alone(learner)(state, both, weight)
-    states, _, told = _together(learner, state, both, weight)
+    weight = fresh * len(fresh) / fresh.sum()
+    learn = _alone(learner)
+    alone, said = jax.device_get(learn(state, both, weight))
+    states, _, told = jax.device_get(_together(learner, state, both, weight))
     a, b = (jax.tree.map(lambda x, k=k: x[k], states) for k in range(2))
     jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
     jax.tree.map(np.testing.assert_array_equal, a.obs_moments, b.obs_moments)
@@ -216,11 +218,9 @@ def test_two_trainers_stay_equal_and_weigh_fresh_unrolls_alike(config) -> None:
     losses = A3cLosses(*(x[0] for x in told.losses))
     np.testing.assert_allclose(said.losses, losses, rtol=1e-4, atol=1e-6)
     # Adam divides by the gradient's size: its moments tell how large it was.
-    np.testing.assert_allclose(
-        *(ravel_pytree(one.opt_state)[0] for one in (alone, a)), rtol=1e-3, atol=1e-6
-    )
+    chex.assert_trees_all_close(alone.opt_state, a.opt_state, rtol=1e-3, atol=1e-6)
     only_fresh = jax.tree.map(lambda x: x[:, fresh > 0], both)
-    _, theirs = _alone(learner)(state, only_fresh, jnp.ones(N + 1))
+    _, theirs = jax.device_get(learn(state, only_fresh, np.ones(N + 1, np.float32)))
     np.testing.assert_allclose(losses, theirs.losses, rtol=1e-4, atol=1e-6)
     name = "value/explained_variance"
     for one in (said.figures[name], told.figures[name][0]):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+from contextlib import suppress
 from typing import Any
 
 import jax.numpy as jnp
 import pytest
+from hydra.core.config_store import ConfigStore
 
 from gmijax.cli.compose import build, compose
 from gmijax.config import (
@@ -115,3 +117,14 @@ def test_a_film_names_the_keys_that_make_another_film_than_the_default():
     assert build("play", PlayConfig, other).film_overrides() == (
         " num_envs=4 seed=3 deterministic=false camera=side"
     )
+
+
+@pytest.mark.parametrize("override", ["num_envs=3", "num_envs=3.5x", "no_key=1"])
+def test_jobs_of_hydra_in_the_same_process_keep_their_settings(override: str):
+    def settings() -> list[Any]:
+        return list(ConfigStore.instance().load("hydra/config.yaml").node.defaults)
+
+    before = settings()
+    with suppress(ConfigError):
+        compose(override)
+    assert settings() == before != []
