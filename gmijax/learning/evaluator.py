@@ -52,7 +52,7 @@ class Evaluation(NamedTuple):
         return self.metrics.get("eval/return")
 
 
-def evaluation_worlds(config: TrainConfig, rank: int, world_size: int) -> Env:
+def evaluation_envs(config: TrainConfig, rank: int, world_size: int) -> Env:
     """The environments in which the GMI with this rank evaluates.
 
     As many on each, so that all run the same program: there may be more than episodes. Without a
@@ -72,7 +72,7 @@ class Evaluator:
     """One GMI's part of the evaluations; all that train must use it in the same way.
 
     Args:
-      env: see `evaluation_worlds`.
+      env: see `evaluation_envs`.
       learner: the networks.
       config: of the run.
       comm: among the GMIs that train.

@@ -22,7 +22,7 @@ from gmijax.errors import CollectiveError
 from gmijax.learning.algorithm import Algorithm
 from gmijax.learning.checkpoint import require_disk_for, require_equal
 from gmijax.learning.checkpoint_saver import CheckpointSaver
-from gmijax.learning.evaluator import Evaluation, Evaluator, evaluation_worlds
+from gmijax.learning.evaluator import Evaluation, Evaluator, evaluation_envs
 from gmijax.learning.iteration_trace import IterationTrace
 from gmijax.learning.learner import Learner, TrainState
 from gmijax.learning.member import Member, Members
@@ -81,7 +81,7 @@ class TrainingLoop:
             self._meter = ThroughputMeter(env, learner, config, comm)
         self._evaluator: Evaluator | None = None
         if config.eval.every is not None:
-            envs = evaluation_worlds(config, comm.rank, comm.world_size)
+            envs = evaluation_envs(config, comm.rank, comm.world_size)
             self._evaluator = Evaluator(envs, learner, config, comm, members.first.run)
         self._env_steps = self._iterations = 0
         self._saver = CheckpointSaver(link.gmi, comm, config.run.keep_checkpoints)

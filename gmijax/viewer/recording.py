@@ -22,21 +22,21 @@ def page(model: Any, trajectory: Trajectory) -> str:
 
     Args:
       model: a `mujoco.MjModel`, of which nothing is changed.
-      trajectory: its worlds stand side by side; one whose episode is over stays as it is.
+      trajectory: its environments stand side by side; one whose episode is over stays as it is.
     """
-    num_steps, num_worlds = trajectory.qpos.shape[:2]
+    num_steps, num_envs = trajectory.qpos.shape[:2]
     stride = max(1, round(1.0 / (trajectory.control_dt_s * MAX_FPS)))
     # viser records what a server shows; nobody asks this one for anything.
     server = open_server(Guard("127.0.0.1"), 0)
     try:
-        scene = Scene(server, model, num_worlds, has_ring=False)
+        scene = Scene(server, model, num_envs, has_ring=False)
         scene.label(trajectory.labels)
         recording = server.get_scene_serializer()
         data = mujoco.MjData(model)
         for step in range(0, num_steps, stride):
             poses = [
-                body_poses(model, data, trajectory.qpos[min(step, int(length)), world])
-                for world, length in enumerate(trajectory.lengths)
+                body_poses(model, data, trajectory.qpos[min(step, int(length)), env])
+                for env, length in enumerate(trajectory.lengths)
             ]
             xpos, xquat = (np.stack(found) for found in zip(*poses, strict=True))
             scene.show(xpos, xquat, 0, follow=True)
