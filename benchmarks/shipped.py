@@ -40,7 +40,7 @@ from gmijax.player.returns import Played, play
 from gmijax.player.shipped import POLICIES
 from gmijax.runs.folder import POLICY, RunPaths, read_json
 from gmijax.runs.history import read_metrics
-from gmijax.runs.resume import CheckpointMeta, best_checkpoint, checkpoints_of
+from gmijax.runs.resume import CheckpointMeta, best_checkpoint, newest_checkpoint
 from gmijax.sweeps.sweep import sweep
 
 SEED = 0
@@ -139,7 +139,7 @@ def keep(
 ) -> None:
     """Ships a checkpoint of a run, and writes down where it is from."""
     if RECIPES[task].ships_last:
-        checkpoint = next(reversed(checkpoints_of(run_dir)), None)
+        checkpoint = newest_checkpoint(run_dir).checkpoint
     else:
         checkpoint = best_checkpoint(run_dir)
     if checkpoint is None:

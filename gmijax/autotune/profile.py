@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.workloads import Workload
@@ -20,9 +20,6 @@ from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.supervise.run_gmis import Launch, OnTick, run_gmis
 from gmijax.supervise.watched_gmi import GmiStatus
-
-LATE: Final = "no end within "
-"""What a `ProfileLate` begins with."""
 
 
 class ProfileLate(Exception):
@@ -98,6 +95,6 @@ def _until(limit_s: float, on_tick: OnTick) -> OnTick:
         on_tick(gmis)
         if running_s() > deadline_s:
             states = ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
-            raise ProfileLate(f"{LATE}{limit_s:.0f} s ({states})")
+            raise ProfileLate(f"no end within {limit_s:.0f} s ({states})")
 
     return watch

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from gmijax.autotune.async_workload import A3cWorkload
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
-from gmijax.autotune.profile import LATE, ProfileLate, profile
+from gmijax.autotune.profile import ProfileLate, profile
 from gmijax.autotune.report import SearchDisplay, draw, plain_data, table, verdict
 from gmijax.autotune.search import OutOfBudget, Rules, SearchOutcome, SearchPoint
 from gmijax.autotune.store import ProfileStore
@@ -227,13 +227,12 @@ class Search:
                 "more, or smaller sizes in search.num_envs"
             )
         first = outcome.visited[0]
-        why = first.result.reason if isinstance(first.result, NotRunnable) else ""
-        is_late = why.startswith(LATE)
-        more = "; give more search.budget_s, or smaller sizes in search.num_envs"
-        raise GmijaxError(
-            f"no point of the search can run; the first, {first.point}: {why}"
-            f"{more if is_late else ''}"
-        )
+        why = more = ""
+        if isinstance(first.result, NotRunnable):
+            why = first.result.reason
+            if first.result.limit_s is not None:  # It was too slow.
+                more = "; give more search.budget_s, or smaller sizes in search.num_envs"
+        raise GmijaxError(f"no point of the search can run; the first, {first.point}: {why}{more}")
 
 
 def _grid(workload: Workload[Any], machine: Machine) -> Grid:

@@ -115,10 +115,9 @@ class SweepWork(Work[Job]):
     def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """See `Work`."""
         del sites
-        said = (why_not_comparable(self.configs, self.ranking),)
-        if any(job.progress.state != "completed" for job in self.jobs):
-            said = (*said, _COMPILES)
-        return tuple(filter(None, said))
+        is_left = any(job.progress.state != "completed" for job in self.jobs)
+        warnings = why_not_comparable(self.configs, self.ranking), _COMPILES if is_left else None
+        return tuple(filter(None, warnings))
 
 
 def sweep_of(

@@ -23,7 +23,7 @@ from gmijax.autotune.workloads import SynchronousWorkload, Workload
 from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
 from gmijax.control import searching
-from gmijax.errors import ConfigError, JobInterrupted
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.machine.host_limits import HostLimits
 from gmijax.machine.snapshot import Machine
 
@@ -173,6 +173,19 @@ def test_a_profile_that_hangs_cannot_run(profiles: Use):
     assert again.asked == []
     assert found("search.budget_s=30")[0].num_envs == 128  # More time than they had.
     assert {point.num_envs for point in again.asked} == {128}
+
+
+def test_more_time_is_advised_where_nothing_ended_in_time_and_only_there(profiles: Use):
+    def late(point: Point) -> Measured:
+        raise ProfileLate(f"{point} is slow")
+
+    profiles(late)
+    advice = "; give more search.budget_s, or smaller sizes in search.num_envs"
+    with pytest.raises(GmijaxError, match=rf"no point of the search can run; .* is slow{advice}$"):
+        found()
+    profiles(lambda point: NotRunnable(f"{point} has no room"))
+    with pytest.raises(GmijaxError, match=r"no point of the search can run; .* has no room$"):
+        found("search.store=other")
 
 
 def test_a_profile_cut_off_by_the_budget_is_no_answer(
