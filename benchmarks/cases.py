@@ -103,24 +103,6 @@ def _async(name: str, gpus: int, num_envs: int, overrides: str = "") -> Case:
     return _case(name, f"{own} num_timesteps=30e6 {overrides}", gpus)
 
 
-def _sac(task: str, updates: int) -> tuple[Case, ...]:
-    """Agents and learner in turn, and in GMIs of their own, with as many updates for each step."""
-    shared = (
-        f"env={task} algo=sac num_envs=4096 algo.updates_per_step={updates} algo.policy_every=2 "
-        "algo.precision=bfloat16 algo.replay_precision=float16 algo.replay_steps=256 "
-        # Time enough for medians, and for a look at what is learnt.
-        f"num_timesteps=12e6 {_NO_RATES} {_NO_CHECKPOINTS}"
-    )
-    return (
-        _case(f"{updates} updates, one program", shared),
-        _case(
-            f"{updates} updates, agent + learner",
-            f"{shared} plan.backend=mps channel.transport=device channel.capacity_mib=256 "
-            "plan.serving_gmis_per_gpu=1",
-        ),
-    )
-
-
 def _on(serving: str, training: str, agents: int, trainers: int) -> str:
     return (
         f"plan.serving_gpus={serving} plan.training_gpus={training} "
@@ -246,11 +228,6 @@ SUITES = MappingProxyType(
             _case("1 GMI x 8192", f"{_THIRTY} num_envs=8192"),
             *_shared(("mps", "share"), 1, 4, _THIRTY),
         ),
-        # Agents and learner of SAC in turn, and beside each other.
-        **{
-            f"sac-{task}": (*_sac(task, 2), *_sac(task, 4))
-            for task in ("ant", "humanoid", "shadow_hand", "go1")
-        },
         # Trainers among their simulators, and in GMIs of their own.
         **{f"templates-{task}": _templates(task, 2048) for task in ("ant", "humanoid")},
         "ant-2gpu": _shared(("mps", "share"), 2, 2, f"{_THIRTY} plan.gpus=2 {_NO_RATES}"),

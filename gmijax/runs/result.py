@@ -31,7 +31,7 @@ class TrainResult:
       profile: see `IterationTrace.outcome`; None where nothing was asked for.
       step_per_s_sim, step_per_s_inference: rates without learning, and without a policy; None
         where they were not measured.
-      pps, ttop, staleness, bytes_per_s: see `gmijax.decoupled.report`; of asynchronous training.
+      pps, ttop, staleness, bytes_per_s: see `gmijax.a3c.report`; of asynchronous training.
       strategy, intra: the exchange that was used, where it may differ from the plan's.
     """
 

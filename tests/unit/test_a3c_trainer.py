@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from toy_env import point_mass
 
+from gmijax.a3c.job_registers import JobRegisters
+from gmijax.a3c.trainer import Trainer
 from gmijax.channels.experience import Rollouts, Spec
 from gmijax.cli.compose import compose
 from gmijax.collectives.communicator import SingleRankCommunicator
-from gmijax.decoupled.job_registers import JobRegisters
-from gmijax.decoupled.trainer import Trainer
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink
 

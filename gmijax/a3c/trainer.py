@@ -15,21 +15,23 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.a3c.a3c import make_update
+from gmijax.a3c.job_registers import JobRegisters
+from gmijax.a3c.leader import Leader
+from gmijax.a3c.report import MAX_COUNTED, BatchCounts, histogram_of
+from gmijax.a3c.targets import Unrolls
 from gmijax.channels.batcher import Batcher
 from gmijax.channels.experience import Rollouts
 from gmijax.clock import running_s
 from gmijax.collectives.interface import Communicator
-from gmijax.config import TrainConfig
-from gmijax.decoupled.algorithm import load_decoupled
-from gmijax.decoupled.job_registers import JobRegisters
-from gmijax.decoupled.leader import Leader
-from gmijax.decoupled.report import MAX_COUNTED, BatchCounts, histogram_of
+from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import CollectiveTimeout
 from gmijax.learning.checkpoint import require_equal
 from gmijax.learning.iteration_trace import IterationTrace
 from gmijax.learning.learner import (
-    LearnerState,
+    TrainState,
     acting_weights,
+    init_learner,
     make_learner,
     pack_weights,
 )
@@ -58,12 +60,11 @@ class Trainer:
     link: ChildLink
 
     def __post_init__(self) -> None:
-        algo, spec, num_envs = self.config.algo, self.env.spec, self.config.envs_per_gmi
-        self._algorithm = load_decoupled(algo)
-        self._flow = self._algorithm.flow(algo, num_envs)
-        self._batch_size = self._flow.batch_unrolls
-        self._learner = make_learner(spec, algo)
-        self._update = self._algorithm.make_update(self._learner, spec, num_envs, self.comm)
+        assert isinstance(self.config.algo, A3cConfig)
+        self._algo = self.config.algo
+        self._batch_size = self._algo.batch_of(self.config.envs_per_gmi)
+        self._learner = make_learner(self.env.spec, self._algo)
+        self._update = make_update(self._learner, self.comm)
         self._env_steps = 0
         self._updates = 0
         traced = self.config.run.profiled if self.comm.rank == 0 else None
@@ -87,16 +88,17 @@ class Trainer:
         leads = self.comm.rank == 0
         # The same key as synchronous training uses: the same first policy.
         state, self._env_steps = first_state(
-            self._algorithm.init, self._learner, self.env.spec.obs_size, self.config
+            init_learner, self._learner, self.env.spec.obs_size, self.config
         )
         self._version = int(state.iteration)
-        self._update.compile(state)
+        self._update.trace((), state, self._example())
+        self._update.compile()
         pack = jax.jit(lambda state: pack_weights(acting_weights(self._learner, state)))
         first = np.asarray(pack(state))
         compile_s = time.monotonic() - started - self.link.start_s["waiting"]
         self.link.beat("ready", 0)
         # And so all trainers have compiled.
-        require_equal(self.comm, self.link.gmi, self._algorithm.learned(state), self._env_steps)
+        require_equal(self.comm, self.link.gmi, state.params, self._env_steps)
         if not leads:
             return {"status": self._loop(state, None), "updates": self._updates}
         leader = Leader(
@@ -109,21 +111,22 @@ class Trainer:
             leader.close()
         return leader.outcome(status, compile_s, self._trace.outcome()).to_dict()
 
-    def _loop(self, state: LearnerState, leader: Leader | None) -> str:
+    def _loop(self, state: TrainState, leader: Leader | None) -> str:
         """Returns the status for the outcome."""
         while True:
             self._trace.begin(self._updates + 1, self._update.wait)
             batch, waited_s = self._receive()
             counts = self._meet(batch, waited_s)
             started = time.monotonic()
+            unrolls = Unrolls(**batch.experience)  # pyright: ignore[reportArgumentType]
             weight = jnp.asarray(self._weights_of(batch) * self._scale(counts))
-            state, updated = self._update(state, batch.experience, weight)
+            state, _, updated = self._update(state, (unrolls, weight))
             self._update.wait()
             weights = np.asarray(updated.weights)
             updated = jax.device_get(updated._replace(weights=None))
             self._version += 1
             self._updates += 1
-            self._env_steps += round(counts.fresh) * self.config.algo.unroll_length
+            self._env_steps += round(counts.fresh) * self._algo.unroll_length
             where = f"{self.config.env.label}, up to env step {self._env_steps}"
             check_losses(where, updated.losses._asdict())
             is_stopped = counts.stop > 0
@@ -140,7 +143,7 @@ class Trainer:
                 break
         if leader is not None:
             leader.end()
-        require_equal(self.comm, self.link.gmi, self._algorithm.learned(state), self._env_steps)
+        require_equal(self.comm, self.link.gmi, state.params, self._env_steps)
         # Agents that wait for room may go: the order to end is published by now.
         self.receiver.close()
         if leader is not None:
@@ -173,9 +176,9 @@ class Trainer:
 
     def _weights_of(self, batch: Rollouts) -> npt.NDArray[np.float32]:
         """[B]: 1 for unrolls within the bound of staleness, 0 for others."""
-        if self._flow.max_staleness is None:
+        if self._algo.max_staleness is None:
             return np.ones(self._batch_size, np.float32)
-        fresh = self._version - batch.versions <= self._flow.max_staleness
+        fresh = self._version - batch.versions <= self._algo.max_staleness
         return fresh.astype(np.float32)
 
     def _scale(self, counts: BatchCounts) -> np.float32:
@@ -194,3 +197,21 @@ class Trainer:
         return BatchCounts(
             stop, fresh, stale, float(gathered[:, 3].max()), gathered[:, 4:].sum(axis=0)
         )
+
+    def _example(self) -> tuple[Unrolls, Any]:
+        """Shapes of a batch and its weights."""
+        steps, size, spec = self._algo.unroll_length, self._batch_size, self.env.spec
+
+        def floats(*shape: int) -> Any:
+            return jax.ShapeDtypeStruct(shape, jnp.float32)
+
+        unrolls = Unrolls(
+            state=floats(steps, size, spec.obs_size),
+            action=floats(steps, size, spec.action_size),
+            reward=floats(steps, size),
+            done=jax.ShapeDtypeStruct((steps, size, 2), jnp.bool_),  # pyright: ignore[reportArgumentType]
+            log_prob=floats(steps, size),
+            cut_value=floats(steps, size),
+            bootstrap=floats(1, size, spec.obs_size),
+        )
+        return unrolls, floats(size)
