@@ -10,6 +10,7 @@ from typing import Any
 from benchmarks.evaluation.figures import NOT_MEASURED
 from benchmarks.evaluation.writer import lines, link, markdown, origin
 from benchmarks.records import RESULTS, Call, calls_by_date
+from benchmarks.walking import SCRIPT
 
 PATTERN = "walking-*-nvidia-*.json"
 HEAD = (
@@ -20,26 +21,34 @@ HEAD = (
 
 @lines("walking")
 def walking() -> list[str]:
-    """The newest call of every task, GPU and kind of start: median, least and most of seeds."""
+    """The newest call of each task, algorithm, GPU and start: median, least and most of seeds."""
     newest: dict[Any, tuple[Call, Path]] = {}
     for call, path in calls_by_date(RESULTS, PATTERN):
         assert call.settings is not None
-        newest[(call.results["task"], call.device, call.settings["cold"])] = call, path
+        kind = call.results["task"], _algo(call), call.device, call.settings["cold"]
+        newest[kind] = call, path
     if not newest:
         return [NOT_MEASURED]
     rows = [
         [
             f"`{task}`",
-            trainer,
+            trainer if trainer == SCRIPT else f"{trainer} {algo}",
             "compiled anew" if is_cold else "from the cache",
             *_cells(row),
             *_end(call, trainer),
         ]
-        for (task, _, is_cold), (call, _) in sorted(newest.items(), key=lambda item: item[0])
+        for (task, algo, _, is_cold), (call, _) in sorted(newest.items(), key=lambda item: item[0])
         for trainer, row in call.results["rows"].items()
     ]
     files = [f"- {link(path.name)}: {origin(call)}" for call, path in newest.values()]
     return [*markdown(HEAD, rows), "", *files]
+
+
+def _algo(call: Call) -> str:
+    """Of our trainings, as it is written."""
+    assert call.settings is not None
+    given = dict(word.split("=", 1) for word in call.settings["overrides"])
+    return given.get("algo", "ppo").upper()
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
