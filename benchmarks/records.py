@@ -131,9 +131,9 @@ def read_calls(path: Path) -> list[Call]:
     return [_of_old_file(found)]
 
 
-def calls_by_date(folder: Path, pattern: str) -> list[tuple[Call, Path]]:
-    """The calls in all files of a folder that match, with their files, oldest first."""
-    found = [(call, path) for path in sorted(folder.glob(pattern)) for call in read_calls(path)]
+def calls_by_date(pattern: str) -> list[tuple[Call, Path]]:
+    """The calls in all files of results that match, with their files, oldest first."""
+    found = [(call, path) for path in sorted(RESULTS.glob(pattern)) for call in read_calls(path)]
     return sorted(found, key=lambda one: str(one[0].date))
 
 

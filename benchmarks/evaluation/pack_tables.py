@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
-from benchmarks.evaluation.writer import lines, link, markdown, origin
-from benchmarks.records import RESULTS, Call, calls_by_date
+from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
+from benchmarks.records import Call, calls_by_date
 from benchmarks.steady import are_alike
 
-_HEAD = (
-    "training | at once | steps/s while all report: | over one: | trainings per hour: | over one:"
-)
 _STEPS, _FINISHED = "steps_per_s", "trainings_per_hour"
 _IN_README: Final = (
     ("mjlab Go1, 4096 environments, 30 iterations", "mjlab Go1"),
@@ -20,17 +17,18 @@ _IN_README: Final = (
 )
 
 
-class _Training(NamedTuple):
-    """The packs of one training in one call, by number at once."""
+class _Training:
+    """The packs of one training in one call, by number at once.
 
-    call: Call
-    file: str
-    ways: Mapping[str, Sequence[Mapping[str, Any]]]
+    Attributes:
+      ways: the rows of each way, in the order of the file.
+    """
 
-    @property
-    def is_mix(self) -> bool:
-        """Whether its jobs are of several kinds, whose steps do not add up."""
-        return not all(are_alike(row["jobs"]) for rows in self.ways.values() for row in rows)
+    def __init__(self, call: Call, name: str) -> None:
+        self.ways: dict[str, list[Mapping[str, Any]]] = {}
+        for row in _succeeded(call):
+            if row["name"] == name:
+                self.ways.setdefault(row["way"], []).append(row)
 
     def rate(self, way: str, key: str) -> Figure | None:
         """A rate over the repeats of a way."""
@@ -42,17 +40,37 @@ class _Training(NamedTuple):
         return over(self.rate(way, key), self.rate(alone, key))
 
 
-@lines("packs")
-def packs() -> list[str]:
-    """Steps per second and trainings per hour of every training, by number at once.
+def _succeeded(call: Call) -> list[Mapping[str, Any]]:
+    return [row for row in call.results.get("rows", ()) if row.get("exit_code") == 0]
 
-    The newest call of each training counts; a ratio is of one call.
-    """
-    found = _trainings()
-    rows = [cells for name, training in found.items() for cells in _rows(name, training)]
-    calls = {(one.file, one.call.date): one.call for one in found.values()}
-    files = [f"- {link(file)}: {origin(call)}" for (file, _), call in calls.items()]
-    return [*markdown(_HEAD, rows), "", *(files or [f"- `packs-*.json`: {NOT_MEASURED}"])]
+
+def _of_trainings() -> Calls:
+    """Of every training the newest call."""
+    calls = calls_by_date("packs-nvidia-*.json")
+    return {row["name"]: (call, path) for call, path in calls for row in _succeeded(call)}
+
+
+@table_of_calls(
+    "packs",
+    "training | at once | steps/s while all report: | over one: | trainings per hour: | over one:",
+    _of_trainings,
+)
+def packs(calls: Calls) -> Rows:
+    """Steps per second and trainings per hour of every training, by number at once."""
+    for name, (call, _) in calls.items():
+        training = _Training(call, name)
+        rows = [row for rows in training.ways.values() for row in rows]
+        is_mix = not all(are_alike(row["jobs"]) for row in rows)  # Its steps do not add up.
+        for number, way in enumerate(training.ways):
+            cells = [
+                *(
+                    shown(training.rate(way, _STEPS), ",.0f"),
+                    shown(training.over_one(way, _STEPS)),
+                ),
+                shown(training.rate(way, _FINISHED), ",.1f"),
+                shown(training.over_one(way, _FINISHED)),
+            ]
+            yield ["" if number else name, way, *(["", ""] if is_mix else cells[:2]), *cells[2:]]
 
 
 class Packed(NamedTuple):
@@ -73,12 +91,11 @@ class Packed(NamedTuple):
 
 def packed() -> list[Packed]:
     """Of the newest calls; nothing without one."""
-    found, way = _trainings(), "8 at once, mps"
-    gains = []
+    calls, way, gains = _of_trainings(), "8 at once, mps", []
     for name, title in _IN_README:
-        training = found.get(name)
-        if training is None:
+        if name not in calls:
             continue
+        training = _Training(calls[name][0], name)
         steps, finished = (training.over_one(way, key) for key in (_STEPS, _FINISHED))
         if steps is not None and finished is not None:
             gains.append(Packed(title, steps, finished, len(training.ways[way])))
@@ -94,27 +111,3 @@ def packed_gains() -> str:
     if not parts:
         return NOT_MEASURED
     return f"eight at once over one, in steps/s and in trainings per hour: {', '.join(parts)}"
-
-
-def _trainings() -> dict[str, _Training]:
-    found: dict[str, _Training] = {}
-    for call, path in calls_by_date(RESULTS, "packs-nvidia-*.json"):
-        rows = [row for row in call.results.get("rows", ()) if row.get("exit_code") == 0]
-        for name in dict.fromkeys(row["name"] for row in rows):
-            ways: dict[str, list[Mapping[str, Any]]] = {}
-            for row in rows:
-                if row["name"] == name:
-                    ways.setdefault(row["way"], []).append(row)
-            found[name] = _Training(call, path.name, ways)
-    return found
-
-
-def _rows(name: str, training: _Training) -> list[list[str]]:
-    rows = []
-    for way in training.ways:
-        cells = [name if not rows else "", way]
-        for key, form in ((_STEPS, ",.0f"), (_FINISHED, ",.1f")):
-            gained = shown(training.rate(way, key), form), shown(training.over_one(way, key))
-            cells += ("", "") if training.is_mix and key == _STEPS else gained
-        rows.append(cells)
-    return rows

@@ -6,9 +6,8 @@ from benchmarks.evaluation import (  # noqa: F401  Each registers its tables.
     claims,
     front,
     learning_tables,
-    off_policy_tables,
+    peer_tables,
     seed_tables,
-    walking_tables,
 )
 from benchmarks.evaluation.async_tables import asynchronous_gains
 from benchmarks.evaluation.figures import bounds, shown

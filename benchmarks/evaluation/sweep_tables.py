@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
 from benchmarks.evaluation.writer import lines, link, markdown, origin
-from benchmarks.records import RESULTS, Call, calls_by_date
+from benchmarks.records import Call, calls_by_date
 
 PATTERN = "sweeps-nvidia-*.json"
 ONE_AFTER_ANOTHER = "1 at once, auto"
@@ -59,7 +59,7 @@ class SameJobs(NamedTuple):
 def same_jobs() -> dict[str, SameJobs]:
     """By what the jobs are and where they ran, in Markdown; in the order of first calls."""
     found: dict[str, SameJobs] = {}
-    for call, path in calls_by_date(RESULTS, PATTERN):
+    for call, path in calls_by_date(PATTERN):
         here: dict[str, dict[str, list[Run]]] = {}
         for run in call.results["runs"]:
             at_once, backend, *tasks = run["way"].split(", ")

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import TypeAlias, TypeVar
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar
 
 from benchmarks.evaluation.figures import NOT_MEASURED, call_of, repeats_of
-from benchmarks.records import Call
+from benchmarks.records import Call, calls_by_date
 
 Rows: TypeAlias = Iterable[Sequence[str]]
+Calls: TypeAlias = Mapping[Any, tuple[Call, Path]]
+"""The calls that a table is of, with their files, by what tells them apart."""
 MakeRows = TypeVar("MakeRows", bound=Callable[[], Rows])
+MakeRowsOfCalls = TypeVar("MakeRowsOfCalls", bound=Callable[[Calls], Rows])
 MakeLines = TypeVar("MakeLines", bound=Callable[[], list[str]])
 
 TABLES: dict[str, Callable[[], list[str]]] = {}
@@ -33,6 +37,56 @@ def table(
         return rows
 
     return register
+
+
+def table_of_calls(
+    name: str,
+    head: str,
+    find: Callable[[], Calls],
+    note: Callable[[Any], str] = lambda _: "",
+    *,
+    is_brief: bool = False,
+) -> Callable[[MakeRowsOfCalls], MakeRowsOfCalls]:
+    """Registers a function of the rows of some calls as a table.
+
+    Args:
+      name: in documents.
+      head: see `markdown`.
+      find: the calls.
+      note: what is said of a call beside its file, by its key.
+      is_brief: calls of which nothing else is said stand once.
+    """
+
+    def register(rows: MakeRowsOfCalls) -> MakeRowsOfCalls:
+        def make() -> list[str]:
+            if not (found := find()):
+                return [NOT_MEASURED]
+            made = made_with(found, note)
+            below = dict.fromkeys(made) if is_brief else made
+            return [*markdown(head, [*rows(found)]), "", *below]
+
+        TABLES[name] = make
+        return rows
+
+    return register
+
+
+def newest(pattern: str, key: Callable[[Call], Any]) -> Calls:
+    """The newest call of each kind, in the files of results that match."""
+    return {key(call): (call, path) for call, path in calls_by_date(pattern)}
+
+
+def made_with(calls: Calls, note: Callable[[Any], str] = lambda _: "") -> list[str]:
+    """A line for each call: its file, the notes of its keys, and with what it was made."""
+    notes: dict[tuple[Path, str | None], list[str]] = {}
+    for key, (call, path) in calls.items():
+        of_call = notes.setdefault((path, call.date), [])
+        of_call += filter(None, [note(key)])
+    made = {(path, call.date): origin(call) for call, path in calls.values()}
+    return [
+        f"- {link(one[0].name)}{', ' * bool(of_call)}{'; '.join(of_call)}: {made[one]}"
+        for one, of_call in notes.items()
+    ]
 
 
 def lines(name: str) -> Callable[[MakeLines], MakeLines]:

@@ -21,10 +21,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from benchmarks.evaluation.peer_tables import HEAD, row
 from benchmarks.evaluation.writer import markdown
-from benchmarks.peers.comparisons import COMPARISONS, MJLAB, missing_package
+from benchmarks.peers.comparisons import COMPARISONS, MJLAB, OURS, missing_package
 from benchmarks.peers.side import Side
-from benchmarks.peers.table import HEAD, OURS, row
 from benchmarks.records import ResultsFile, device_name, file_name
 from benchmarks.runner import (
     STOP_S,

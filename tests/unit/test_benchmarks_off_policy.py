@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.evaluation.off_policy_tables import over_the_same_ratio
+from benchmarks.evaluation.async_tables import over_the_same_ratio
 from benchmarks.off_policy import LEAD, held_rate, summary
 
 

@@ -16,8 +16,10 @@ import jax.numpy as jnp
 import pytest
 from brax.training.agents.ppo import networks, train
 
-from benchmarks import runner
-from benchmarks.evaluation import peer_tables
+from benchmarks import records, runner
+from benchmarks.evaluation.figures import NOT_MEASURED
+from benchmarks.evaluation.page import TABLES
+from benchmarks.evaluation.peer_tables import row
 from benchmarks.peers import __main__ as peers
 from benchmarks.peers import returns
 from benchmarks.peers.brax_ppo import replicated
@@ -25,12 +27,12 @@ from benchmarks.peers.comparisons import (
     BRAX,
     COMPARISONS,
     MJLAB,
+    OURS,
     REPORTS,
     Comparison,
     brax_training,
 )
 from benchmarks.peers.side import Side
-from benchmarks.peers.table import OURS, row
 from benchmarks.records import read_calls
 from gmijax.cli.compose import compose
 from gmijax.config import RolloutConfig
@@ -225,14 +227,14 @@ def test_what_does_not_compile_is_told_once(tmp_path: Path, monkeypatch: pytest.
 def test_the_table_takes_the_newest_call_that_measured_both_sides(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(peer_tables, "RESULTS", tmp_path)
-    assert peer_tables.peers()[0].endswith("not measured (`python -m benchmarks.peers`).")
+    monkeypatch.setattr(records, "RESULTS", tmp_path)
+    assert TABLES["peers"]() == [NOT_MEASURED]
     made = benchmark(monkeypatch, tmp_path, Fake(), "ant, MJX-JAX", repeats=1)
     benchmark(monkeypatch, tmp_path / "2", Fake("gmijax.train"), "ant, MJX-JAX", repeats=1)
     calls = [json.loads(made.file.path.read_text())["calls"][0]]
     calls += json.loads((tmp_path / "2" / made.file.path.name).read_text())["calls"]
     path = tmp_path / "peers-nvidia-h200.json"
     path.write_text(json.dumps({"format": 2, "suite": "peers", "calls": calls}))
-    table = peer_tables.peers()
+    table = TABLES["peers"]()
     assert "| ant, MJX-JAX | Brax | 200 | 100 | 2.00 | 60.0 | 60.0 |" in table
-    assert sum("not measured" in line for line in table) == len(COMPARISONS) - 1
+    assert sum(NOT_MEASURED in line for line in table) == len(COMPARISONS) - 1

@@ -13,9 +13,9 @@ import pytest
 from supervision import save_meta
 
 import gmijax
-from benchmarks import walking, walking_tests
-from benchmarks.evaluation import walking_tables
+from benchmarks import records, walking, walking_tests
 from benchmarks.evaluation.figures import NOT_MEASURED
+from benchmarks.evaluation.page import TABLES
 from benchmarks.records import ResultsFile, read_calls
 from benchmarks.walking import _theirs, summary, walks_from
 from benchmarks.walking_tests import Policy, policy_of, walks_twice
@@ -195,8 +195,8 @@ def test_a_policy_of_brax_gets_its_observations_by_name(tmp_path):
 
 
 def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypatch):
-    monkeypatch.setattr(walking_tables, "RESULTS", tmp_path)
-    assert walking_tables.walking() == [NOT_MEASURED]
+    monkeypatch.setattr(records, "RESULTS", tmp_path)
+    assert TABLES["walking"]() == [NOT_MEASURED]
     row = {"seeds": 5, "walk": 5, "env_steps": [4e7, 5e7, 6e7]}
     for is_cold, seconds in ((False, 99.0), (False, 60.0), (True, 100.0)):
         path = tmp_path / "walking-go1-nvidia-h100.json"
@@ -207,7 +207,7 @@ def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypat
         runs = [{"trainer": "gmijax", "checkpoints": [tested, {"env_steps": 8e7}]}] * 5
         with file.changing() as results:
             results.update(task="go1", rows={"gmijax": row | spread}, runs=runs)
-    lines = walking_tables.walking()
+    lines = TABLES["walking"]()
     rows = [line for line in lines if line.startswith("| `go1`")]
     walk, share = "5 of 5 | 50 (40 to 60)", "70 | 99.5%"
     assert rows == [
