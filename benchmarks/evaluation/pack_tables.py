@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
 from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
@@ -11,10 +11,8 @@ from benchmarks.records import Call, calls_by_date
 from benchmarks.steady import are_alike
 
 _STEPS, _FINISHED = "steps_per_s", "trainings_per_hour"
-_IN_README: Final = (
-    ("mjlab Go1, 4096 environments, 30 iterations", "mjlab Go1"),
-    ("CleanRL PPO, gmijax ant, 2048 environments", "CleanRL's PPO"),
-)
+MJLAB: Final = "mjlab Go1, 4096 environments, 30 iterations"
+CLEANRL: Final = "CleanRL PPO, gmijax ant, 2048 environments"
 
 
 class _Training:
@@ -73,41 +71,11 @@ def packs(calls: Calls) -> Rows:
             yield ["" if number else name, way, *(["", ""] if is_mix else cells[:2]), *cells[2:]]
 
 
-class Packed(NamedTuple):
-    """Eight trainings of another library at once, over one alone.
-
-    Attributes:
-      name: of the training.
-      steps_per_s: ratio of steps per second.
-      trainings_per_hour: ratio of finished trainings per hour, start-up included.
-      repeats: of both.
-    """
-
-    name: str
-    steps_per_s: float
-    trainings_per_hour: float
-    repeats: int
-
-
-def packed() -> list[Packed]:
-    """Of the newest calls; nothing without one."""
-    calls, way, gains = _of_trainings(), "8 at once, mps", []
-    for name, title in _IN_README:
-        if name not in calls:
-            continue
-        training = _Training(calls[name][0], name)
-        steps, finished = (training.over_one(way, key) for key in (_STEPS, _FINISHED))
-        if steps is not None and finished is not None:
-            gains.append(Packed(title, steps, finished, len(training.ways[way])))
-    return gains
-
-
-def packed_gains() -> str:
-    """In words, what eight at once gain."""
-    parts = [
-        f"{one.name} {one.steps_per_s:.2f} and {one.trainings_per_hour:.2f} (n={one.repeats})"
-        for one in packed()
-    ]
-    if not parts:
-        return NOT_MEASURED
-    return f"eight at once over one, in steps/s and in trainings per hour: {', '.join(parts)}"
+def eight_packed(name: str) -> dict[str, str]:
+    """What eight of a training at once gain over one, in `n` repeats of its newest call."""
+    calls, way = _of_trainings(), "8 at once, mps"
+    if name not in calls:
+        return {"steps": NOT_MEASURED, "finished": NOT_MEASURED, "n": "0"}
+    training = _Training(calls[name][0], name)
+    steps, finished = (shown(training.over_one(way, key)) for key in (_STEPS, _FINISHED))
+    return {"steps": steps, "finished": finished, "n": str(len(training.ways.get(way, ())))}

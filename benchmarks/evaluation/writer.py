@@ -99,6 +99,11 @@ def lines(name: str) -> Callable[[MakeLines], MakeLines]:
     return register
 
 
+def filled(name: str, **values: str | Mapping[str, str]) -> list[str]:
+    """The table in `<name>.md`, with figures in the places of their names."""
+    return (Path(__file__).parent / f"{name}.md").read_text().format(**values).splitlines()
+
+
 def markdown(head: str, rows: Sequence[Sequence[str]]) -> list[str]:
     """A table; the columns of `head` are divided by `|`, those of numbers end with a colon."""
     names = [name.strip() for name in head.split("|")]
