@@ -19,14 +19,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import gmijax
-from benchmarks.records import ResultsFile, device_name, file_name
-from benchmarks.runner import exit_code, options
+from benchmarks.records import results_file
+from benchmarks.runner import exit_code, in_turn, options
 from gmijax.config import SacConfig, TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.machine.nvidia import load_of
@@ -205,16 +204,11 @@ def main() -> int:
     config = gmijax.compose(*given.overrides)
     if not isinstance(config.algo, SacConfig):
         raise ConfigError(f"algo={config.algo.name}: must be sac here")
-    path = Path(given.out) / file_name(f"off-policy-{config.env.slug}", device_name())
-    file = ResultsFile(path, "off_policy", vars(given))
-    repeats: list[Mapping[str, Any]] = []
-    what = resolved(config, config.algo)
-    for _ in range(given.repeats):
-        for backend in given.backends:
-            repeats.append(measured(given, config, backend))
-            with file.changing() as results:
-                results.update(resolved=what, repeats=repeats, summary=summary(repeats))
-    for backend, gains in summary(repeats).items():
+    file = results_file(given, "off-policy", f"-{config.env.slug}")
+    file.results["resolved"] = resolved(config, config.algo)
+    for _, backend in in_turn(given.backends, given.repeats):
+        file.add("repeats", measured(given, config, backend))
+    for backend, gains in summary(file.results["repeats"]).items():
         shown = ", ".join(f"{name} {gain:.2f}x" for name, gain in gains.items())
         sys.stdout.write(f"{backend}: {shown} of one program, medians of {given.repeats}\n")
     return 0

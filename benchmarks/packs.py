@@ -69,10 +69,8 @@ class Benchmark:
             for _, way in in_turn(ways, 1, self._deadline_s):
                 row = {"name": self._given.name, "way": str(way), "repeat": number}
                 row |= self._pack(way, gpus)
-                with self._file.changing() as results:
-                    results["rows"] = [*results.get("rows", []), row]
-                sys.stdout.write(f"{json.dumps(row)}\n")
-                sys.stdout.flush()
+                self._file.add("rows", row)
+                print(json.dumps(row), flush=True)
                 num_rows += 1
         return num_rows == len(ways)
 

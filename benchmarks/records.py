@@ -7,6 +7,7 @@ A file from before this format is read as one call, and what it does not say is 
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import shlex
@@ -115,6 +116,18 @@ class ResultsFile:
             calls = [call for call in found if call.date != self._call.date] + [self._call]
             data = {"format": FORMAT, "suite": self.suite}
             write_json(self.path, {**data, "calls": [call._asdict() for call in calls]})
+
+    def add(self, key: str, row: Mapping[str, Any], **more: Any) -> None:
+        """Adds a row to one of the lists in `results`, and what else is known by then."""
+        with self.changing() as results:
+            results.setdefault(key, []).append(row)
+            results.update(more)
+
+
+def results_file(given: argparse.Namespace, suite: str, of: str = "") -> ResultsFile:
+    """The file of a benchmark here, e.g. `seeds-ant-nvidia-h200.json` with `of="-ant"`."""
+    path = given.out / file_name(f"{suite}{of}", device_name())
+    return ResultsFile(path, suite, vars(given))
 
 
 def read_calls(path: Path) -> list[Call]:

@@ -14,10 +14,11 @@ import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, TypeVar
+from typing import IO, Any, TypeVar
 
 from benchmarks.records import RESULTS
 from gmijax.errors import ConfigError
+from gmijax.runs.folder import read_json
 
 STOP_S = 15.0
 """For a command that meets its deadline to save and end."""
@@ -128,6 +129,28 @@ def run_command(
 ) -> int:
     """Runs one command, see `start` and `wait_until`; returns its exit code."""
     return wait_until(deadline_s, start(command, variables or {}))[0]
+
+
+def sweep_report(
+    words: Sequence[str],
+    folder: Path,
+    deadline_s: float,
+    variables: Mapping[str, str] | None = None,
+) -> tuple[int, dict[str, Any]]:
+    """Runs a sweep in a folder: its exit code, and its `sweep.json`; ends this if it wrote none.
+
+    Args:
+      words: of `gmijax.sweep`.
+      folder: of the sweep.
+      deadline_s: see `wait_until`.
+      variables: of the environment.
+    """
+    more = ("run.measure_throughput=false", *words, f"run.dir={folder}")
+    code = run_command([sys.executable, "-m", "gmijax.sweep", *more], deadline_s, variables)
+    report = folder / "sweep.json"
+    if not report.exists():
+        raise SystemExit(f"no result of a sweep with {' '.join(words)} (exit code {code})")
+    return code, read_json(report)
 
 
 def failure_of(command: Sequence[str], folder: Path | None = None) -> str | None:

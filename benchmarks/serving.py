@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.records import results_file
 from benchmarks.runner import as_word, exit_code, failure_of, in_turn, options
 from gmijax.runs.folder import RunPaths, read_json
 
@@ -60,16 +60,13 @@ class Setting(NamedTuple):
 def main() -> int:
     """Measures what the command line asks for; returns 1 if a job failed, else 0."""
     given = _options()
-    file = ResultsFile(given.out / file_name("serving", device_name()), "serving", vars(given))
-    cases: list[dict[str, Any]] = []
+    file = results_file(given, "serving")
     for task, backend, m in itertools.product(given.tasks, given.backends, given.simulators):
         # The environments of a task are split over its simulators.
-        cases.append(measure(Setting(task, backend, m, given.envs // m), given))
-        sys.stdout.write(f"{line(cases[-1])}\n")
-        sys.stdout.flush()
-        with file.changing() as results:
-            results["cases"] = cases
-    return int(any("failed" in case for case in cases))
+        case = measure(Setting(task, backend, m, given.envs // m), given)
+        file.add("cases", case)
+        print(line(case), flush=True)
+    return int(any("failed" in case for case in file.results["cases"]))
 
 
 def measure(setting: Setting, given: argparse.Namespace) -> dict[str, Any]:

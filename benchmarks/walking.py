@@ -32,7 +32,7 @@ from typing import Any
 
 import gmijax
 from benchmarks.peers.side import variables_of_brax
-from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.records import results_file
 from benchmarks.runner import deadline, exit_code, in_turn, options, run_command
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
@@ -56,8 +56,7 @@ class Benchmark:
         self._given, self._config, self._scratch = given, config, scratch
         self._deadline_s = deadline(given.deadline_s)
         self._trained_by_s = self._deadline_s - given.reserve_s
-        path = given.out / file_name(f"walking-{config.env.slug}", device_name())
-        self.file = ResultsFile(path, "walking", vars(given))
+        self.file = results_file(given, "walking", f"-{config.env.slug}")
         self.runs: list[dict[str, Any]] = []
         self._code_of_tests = 0
 

@@ -25,7 +25,7 @@ from benchmarks.evaluation.peer_tables import HEAD, row
 from benchmarks.evaluation.writer import markdown
 from benchmarks.peers.comparisons import COMPARISONS, MJLAB, OURS, missing_package
 from benchmarks.peers.side import Side
-from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.records import results_file
 from benchmarks.runner import (
     STOP_S,
     as_word,
@@ -50,9 +50,7 @@ class Benchmark:
     def __init__(self, given: argparse.Namespace, scratch: Path, sides: Sequence[Side]) -> None:
         self._given, self._scratch, self._sides = given, scratch, list(sides)
         self._deadline_s = deadline(given.deadline_s)
-        self.file = ResultsFile(
-            given.out / file_name("peers", device_name()), "peers", vars(given)
-        )
+        self.file = results_file(given, "peers")
         self._runs: dict[Side, list[dict[str, Any]]] = {side: [] for side in sides}
         self.file.results["cases"] = {
             str(side): {"told": side.told, "runs": runs} for side, runs in self._runs.items()

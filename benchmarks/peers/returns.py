@@ -15,12 +15,10 @@ from typing import Any
 
 from benchmarks.peers.comparisons import Comparison, brax_training
 from benchmarks.peers.side import variables_of_brax
-from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.records import results_file
 from benchmarks.runner import deadline, exit_code, options, start, wait_until
 from gmijax.runs.folder import read_json, write_json
 from gmijax.supervise.failures import last_line
-
-SUITE = "brax-returns"
 
 
 def told(task: str, more: tuple[str, ...], seed: int) -> dict[str, Any]:
@@ -76,7 +74,7 @@ def main() -> int:
     given = parser.parse_args()
     names = {f"{task}-{seed}": (task, seed) for task in given.tasks for seed in range(given.seeds)}
     tasks = {name: told(task, tuple(given.override), seed) for name, (task, seed) in names.items()}
-    file = ResultsFile(given.out / file_name(SUITE, device_name()), SUITE, vars(given))
+    file = results_file(given, "brax-returns")
     with tempfile.TemporaryDirectory() as scratch:
         found = train(tasks, Path(scratch), given.timeout_s)
     with file.changing() as results:

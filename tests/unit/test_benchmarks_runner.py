@@ -210,8 +210,9 @@ def run_benchmark(
 ) -> int:
     module = importlib.import_module(f"benchmarks.{name}")
     for function, fake in (("run_command", commands.run), ("failure_of", commands.failure_of)):
-        if hasattr(module, function):
-            monkeypatch.setattr(module, function, fake)
+        for user in (runner, module):
+            if hasattr(user, function):
+                monkeypatch.setattr(user, function, fake)
     for user in (records, module):
         if hasattr(user, "detect_machine"):
             monkeypatch.setattr(user, "detect_machine", lambda: machine(0))
