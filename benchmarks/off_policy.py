@@ -5,21 +5,18 @@ two GMIs at the same time. The two GMIs exchange neither experience nor weights:
 GPU allows before anything is moved. Each acts or learns as fast as it can (`free`), or waits for
 the other so that the ratio of updates to steps is that of one program (`held`). The learner draws
 from a full replay. Adds a call to `benchmarks/results/off-policy-<task>-<device>.json`: rounds
-(steps of all environments) and updates of the critics per second, and how busy the GPU was.
+(steps of all environments) and updates of the critics per second.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -28,95 +25,54 @@ from benchmarks.records import results_file
 from benchmarks.runner import exit_code, in_turn, options
 from gmijax.config import SacConfig, TrainConfig
 from gmijax.errors import ConfigError
-from gmijax.machine.nvidia import load_of
 
 LEAD = 2
 """Iterations that one of two GMIs may be ahead of the other where the ratio is held."""
 
-_SAMPLE_S = 0.1
 _SHOWN = (
     *("batch_size", "updates_per_step", "policy_every", "unroll_length", "replay_steps"),
     *("precision", "replay_precision", "critic_hidden_layer_sizes", "policy_hidden_layer_sizes"),
 )
 
 
-class Window(NamedTuple):
-    """A measurement: iterations per second, and the part of the time in which the GPU was busy.
-
-    NVML says the latter, of all processes together; None where it does not.
-    """
-
-    rate: float
-    utilisation: float | None = None
-
-
 class Alternating(gmijax.Role):
     """One GMI: both in turn in one program, then each alone."""
 
-    def run(self, overrides: tuple[str, ...], window_s: float) -> dict[str, Window]:
-        """How fast each is."""
+    def run(self, overrides: tuple[str, ...], window_s: float) -> dict[str, float]:
+        """How fast each is, in iterations per second."""
         from benchmarks.off_policy_programs import Programs
 
         programs = Programs(overrides)
         steps = {"both": programs.both, "act": programs.act, "learn": programs.learn}
-        return {name: free_window(self, step, window_s) for name, step in steps.items()}
+        return {name: free_rate(self, step, window_s) for name, step in steps.items()}
 
 
 class Separate(gmijax.Role):
     """One of two GMIs: the first acts, the second learns."""
 
-    def run(self, overrides: tuple[str, ...], window_s: float) -> dict[str, Window]:
-        """How fast this one is, free and with the ratio held."""
+    def run(self, overrides: tuple[str, ...], window_s: float) -> dict[str, float]:
+        """How fast this one is in iterations per second, free and with the ratio held."""
         from benchmarks.off_policy_programs import Programs
 
         programs = Programs(overrides)
         step = programs.act if self.rank == 0 else programs.learn
-        free = free_window(self, step, window_s)
-        rates = self.collective(np.eye(2)[self.rank] * free.rate, "sum")
+        free = free_rate(self, step, window_s)
+        rates = self.collective(np.eye(2)[self.rank] * free, "sum")
         count = max(LEAD + 1, int(window_s * min(rates)))  # The same on both: none waits in vain.
-        with sampled_utilisation(self.rank) as samples:
-            held = held_rate(self, step, count)
-        return {"free": free, "held": Window(held, mean_of(samples))}
+        return {"free": free, "held": held_rate(self, step, count)}
 
 
-@contextmanager
-def sampled_utilisation(rank: int) -> Iterator[list[float]]:
-    """Samples of the use of the first GMI's GPU while it is entered; none on the others."""
-    device, samples, is_over = os.environ.get("CUDA_VISIBLE_DEVICES"), [], threading.Event()
-
-    def sample() -> None:
-        while device and not is_over.wait(_SAMPLE_S) and (load := load_of(device)) is not None:
-            samples.append(load.busy)
-
-    thread = threading.Thread(target=sample, daemon=True)
-    if rank == 0:
-        thread.start()
-    try:
-        yield samples
-    finally:
-        is_over.set()
-        if rank == 0:
-            thread.join()
-
-
-def mean_of(samples: Sequence[float]) -> float | None:
-    """The mean, None of no samples."""
-    return statistics.fmean(samples) if samples else None
-
-
-def free_window(role: gmijax.Role, step: Callable[[], None], window_s: float) -> Window:
-    """A measurement that all GMIs begin together."""
+def free_rate(role: gmijax.Role, step: Callable[[], None], window_s: float) -> float:
+    """Iterations per second in a window that all GMIs begin together."""
     for _ in range(3):
         step()
     role.collective(0.0)
-    with sampled_utilisation(role.rank) as samples:
-        started_s, count = time.monotonic(), 0
-        while time.monotonic() - started_s < window_s:
-            step()
-            count += 1
-            role.progress(count)
-        rate = count / (time.monotonic() - started_s)
-    return Window(rate, mean_of(samples))
+    started_s, count = time.monotonic(), 0
+    while time.monotonic() - started_s < window_s:
+        step()
+        count += 1
+        role.progress(count)
+    return count / (time.monotonic() - started_s)
 
 
 def held_rate(role: gmijax.Role, step: Callable[[], None], count: int) -> float:
@@ -156,27 +112,25 @@ def measured(given: argparse.Namespace, config: Any, backend: Any) -> dict[str, 
             two, Separate(), overrides, given.window_s, run_dir=f"{folder}/two"
         )
     updates = per_iteration * config.algo.updates_per_step
-    held = min(agent["held"].rate, learner["held"].rate)
+    held = min(agent["held"], learner["held"])
     return {
         "backend": backend,
         "in_turn": {
-            "rounds_per_s": per_iteration * alone["both"].rate,
-            "updates_per_s": updates * alone["both"].rate,
-            "acting_alone_rounds_per_s": per_iteration * alone["act"].rate,
-            "learning_alone_updates_per_s": updates * alone["learn"].rate,
-            "utilisation": {name: window.utilisation for name, window in alone.items()},
+            "rounds_per_s": per_iteration * alone["both"],
+            "updates_per_s": updates * alone["both"],
+            "acting_alone_rounds_per_s": per_iteration * alone["act"],
+            "learning_alone_updates_per_s": updates * alone["learn"],
         },
         "two_gmis": {
-            "free_rounds_per_s": per_iteration * agent["free"].rate,
-            "free_updates_per_s": updates * learner["free"].rate,
+            "free_rounds_per_s": per_iteration * agent["free"],
+            "free_updates_per_s": updates * learner["free"],
             "held_rounds_per_s": per_iteration * held,
             "held_updates_per_s": updates * held,
-            "utilisation": {name: window.utilisation for name, window in agent.items()},
         },
         "gain": {
-            "rounds_free": agent["free"].rate / alone["both"].rate,
-            "updates_free": learner["free"].rate / alone["both"].rate,
-            "held": held / alone["both"].rate,
+            "rounds_free": agent["free"] / alone["both"],
+            "updates_free": learner["free"] / alone["both"],
+            "held": held / alone["both"],
         },
     }
 

@@ -12,13 +12,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import IO, Any, NamedTuple, TypeVar
 
 from benchmarks.records import RESULTS
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import read_json
+from gmijax.supervise.failures import last_line
 
 STOP_S = 15.0
 """For a command that meets its deadline to save and end."""
@@ -129,6 +130,28 @@ def run_command(
 ) -> int:
     """Runs one command, see `start` and `wait_until`; returns its exit code."""
     return wait_until(deadline_s, start(command, variables or {}))[0]
+
+
+class Command(NamedTuple):
+    """A command whose output goes to `log` in a folder, with variables of its environment."""
+
+    words: Sequence[str]
+    folder: Path
+    variables: Mapping[str, str]
+
+
+def failures_of(commands: Sequence[Command], deadline_s: float) -> list[str | None]:
+    """Runs commands at the same time; the last line of those that failed, else None."""
+    with ExitStack() as logs:
+        processes = [
+            start(one.words, one.variables, logs.enter_context((one.folder / "log").open("wb")))
+            for one in commands
+        ]
+        codes = wait_until(deadline_s, *processes)
+    return [
+        (last_line(one.folder / "log") or f"exit code {code}") if code else None
+        for one, code in zip(commands, codes, strict=True)
+    ]
 
 
 def sweep_report(

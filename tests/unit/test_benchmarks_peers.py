@@ -146,10 +146,12 @@ def test_returns_are_kept_up_to_where_a_run_failed(
         "sys.exit('no room' if seed else 0)"
     )
 
-    def started(told: Sequence[str], variables: dict[str, str], log: Any) -> Any:
-        return runner.start([sys.executable, "-c", script, *told[-2:]], variables, log)
+    start = runner.start
 
-    monkeypatch.setattr(returns, "start", started)
+    def started(told: Sequence[str], variables: dict[str, str], log: Any) -> Any:
+        return start([sys.executable, "-c", script, *told[-2:]], variables, log)
+
+    monkeypatch.setattr(runner, "start", started)
     tasks = {f"a-{seed}": returns.told("PointMass", (), seed) for seed in (0, 1)}
     curve = [[100, 1.0], [200, 2.0]]
     assert returns.train(tasks, tmp_path, 60.0) == {
@@ -192,7 +194,7 @@ def benchmark(
     monkeypatch: pytest.MonkeyPatch, folder: Path, fake: Fake, *only: str, **options: Any
 ) -> peers.Benchmark:
     for name in ("start", "wait_until"):
-        monkeypatch.setattr(peers, name, getattr(fake, name))
+        monkeypatch.setattr(runner, name, getattr(fake, name))
     monkeypatch.setattr(peers.os, "cpu_count", lambda: 8)
     arguments = {"repeats": 3, "timeout_s": 600.0, "deadline_s": None, **options}
     sides = [side for side in peers.wanted_sides(only, ()) if "Warp" not in side.comparison]
