@@ -122,20 +122,25 @@ def _is_answer(point: dict[str, Any], best: dict[str, Any]) -> bool:
     return all(point[key] == best[key] for key in ("gmis_per_gpu", "num_envs", "impl"))
 
 
-@table(
-    "reduction",
-    "GPUs x GMIs | exchange | alone, ms: | 10 to 90 %: | in a chain, ms: | over the model:",
-    REDUCTION,
+REDUCTION_HEAD = (
+    "GPUs x GMIs | exchange | alone, ms: | 10 to 90 %: | in a chain, ms: | over the model:"
 )
+
+
+@table("reduction", REDUCTION_HEAD, REDUCTION)
 def reduction() -> Rows:
     """A mean of 1.5 million numbers, alone and in a chain."""
-    for row in results_of(REDUCTION).get("rows", ()):
-        if row["num_floats"] == 1_500_000:
-            keys = ("median_s", "p10_s", "p90_s", "chained_s")
-            alone, low, high, chained = (f"{1e3 * row[key]:.3f}" for key in keys)
-            fit = row["median_s"] / row["predicted_s"] if row["predicted_s"] else None
-            name = [read_layout(row["layout"]), f"`{row['name']}`"]
-            yield [*name, alone, f"{low} to {high}", chained, shown(fit)]
+    rows = results_of(REDUCTION).get("rows", ())
+    return [reduction_row(row) for row in rows if row["num_floats"] == 1_500_000]
+
+
+def reduction_row(row: Mapping[str, Any]) -> list[str]:
+    """A mean by one way of exchange."""
+    keys = ("median_s", "p10_s", "p90_s", "chained_s")
+    alone, low, high, chained = (f"{1e3 * row[key]:.3f}" for key in keys)
+    fit = row["median_s"] / row["predicted_s"] if row["predicted_s"] else None
+    name = [read_layout(row["layout"]), f"`{row['name']}`"]
+    return [*name, alone, f"{low} to {high}", chained, shown(fit)]
 
 
 def read_layout(text: str) -> str:
