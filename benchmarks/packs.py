@@ -15,13 +15,11 @@ import json
 import sys
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.records import ResultsFile, file_name
-from benchmarks.runner import FreeGpus, deadline, exit_code, in_turn, options, run_command
+from benchmarks.runner import deadline, exit_code, in_turn, on_free_gpus, options, run_command
 from benchmarks.steady import rate_of_jobs
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.runs.folder import read_json
@@ -53,25 +51,24 @@ class Benchmark:
         path = given.out / file_name("packs", device)
         self._file = ResultsFile(path, "packs", settings, device=of_one)
         self._deadline_s = deadline(given.deadline_s)
-        count = min(given.gpus, len(machine.gpus))
-        self._free = FreeGpus(count) if count > 1 else None
 
     def run(self, ways: Sequence[Way]) -> bool:
         """Whether there was time for all."""
-        if self._free is None:  # In this thread, which signals interrupt.
-            return all([self._repeat(number, ways) for number in range(self._given.repeats)])
-        with ThreadPoolExecutor(self._free.count) as pool:
-            return all([*pool.map(lambda n: self._repeat(n, ways), range(self._given.repeats))])
+        count, repeats = min(self._given.gpus, len(self._machine.gpus)), range(self._given.repeats)
 
-    def _repeat(self, number: int, ways: Sequence[Way]) -> bool:
+        def repeat(number: int, gpus: Sequence[int]) -> bool:
+            return self._repeat(number, ways, gpus)
+
+        return all(on_free_gpus(count if count > 1 else None, repeats, lambda _: 1, repeat))
+
+    def _repeat(self, number: int, ways: Sequence[Way], gpus: Sequence[int]) -> bool:
         num_rows = 0
-        with self._free.taken() if self._free else nullcontext(()) as gpus:
-            for _, way in in_turn(ways, 1, self._deadline_s):
-                row = {"name": self._given.name, "way": str(way), "repeat": number}
-                row |= self._pack(way, gpus)
-                self._file.add("rows", row)
-                print(json.dumps(row), flush=True)
-                num_rows += 1
+        for _, way in in_turn(ways, 1, self._deadline_s):
+            row = {"name": self._given.name, "way": str(way), "repeat": number}
+            row |= self._pack(way, gpus)
+            self._file.add("rows", row)
+            print(json.dumps(row), flush=True)
+            num_rows += 1
         return num_rows == len(ways)
 
     def _pack(self, way: Way, gpus: Sequence[int]) -> dict[str, Any]:

@@ -14,8 +14,6 @@ import statistics
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +21,7 @@ from benchmarks.cases import SUITES, Case
 from benchmarks.evaluation.figures import Figure, figure, over, shown
 from benchmarks.evaluation.writer import markdown
 from benchmarks.records import ResultsFile
-from benchmarks.runner import FreeGpus, as_word, exit_code, failure_of, in_turn, options
+from benchmarks.runner import as_word, exit_code, failure_of, in_turn, on_free_gpus, options
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
@@ -54,7 +52,7 @@ def main() -> int:
             for repeat, case in in_turn(cases, given.repeats)
             if case not in large and not is_done(file.results, case, repeat)
         ]
-        run_all(turns, FreeGpus(given.gpus) if given.gpus else None)
+        on_free_gpus(given.gpus or None, turns, lambda turn: turn.case.gpus, _Turn.run)
     for _, file in files:
         print(*table(file.results), f"written: {file.path}", sep="\n")
     return int(any(failures(file.results) for _, file in files))
@@ -85,37 +83,17 @@ class _Turn(NamedTuple):
     repeat: int
     runs: Path
 
-    def run(self, overrides: Sequence[str]) -> None:
+    def run(self, gpus: Sequence[int]) -> None:
         """Runs it, and writes: an interruption loses the running ones only."""
         name = f"{self.file.suite}-{as_word(self.case.name)}-{self.repeat}"
         folder = unused(self.runs / name)
-        done = run_case(self.case, self.repeat, (*overrides, f"run.dir={folder}"), folder)
+        own = (f"plan.gpus=[{','.join(map(str, gpus))}]",) if gpus else ()
+        done = run_case(self.case, self.repeat, (*own, f"run.dir={folder}"), folder)
         with self.file.changing() as results:
             kept = results["cases"][self.case.name]
             kept["config"] = done.pop("config", kept.get("config"))
             # Runs that go on at the same time are noted as they end: each has its number.
             kept["runs"].append({**done, "repeat": self.repeat})
-
-
-def run_all(turns: Sequence[_Turn], free: FreeGpus | None) -> None:
-    """One after the other, or as soon as GPUs are free for them."""
-
-    def run(turn: _Turn) -> None:
-        with free.taken(turn.case.gpus) if free else nullcontext(()) as gpus:
-            turn.run((f"plan.gpus=[{','.join(map(str, gpus))}]",) if free else ())
-
-    if free is None:  # In this thread, which signals interrupt.
-        for turn in turns:
-            run(turn)
-        return
-    with ThreadPoolExecutor(free.count) as pool:
-        started = [pool.submit(run, turn) for turn in turns]
-        try:
-            for one in started:
-                one.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
 
 
 def unused(folder: Path) -> Path:
