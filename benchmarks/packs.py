@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.records import ResultsFile, file_name
+from benchmarks.records import results_file
 from benchmarks.runner import deadline, exit_code, in_turn, on_free_gpus, options, run_command
 from benchmarks.steady import rate_of_jobs
 from gmijax.machine.snapshot import Machine, detect_machine
@@ -44,12 +44,9 @@ class Benchmark:
 
     def __init__(self, given: argparse.Namespace, machine: Machine) -> None:
         self._given, self._machine = given, machine
-        device = machine.gpus[0].name if machine.gpus else "cpu"
-        settings = {**vars(given), "command": list(given.command)}
         # Each row is of one GPU, however many work at the same time.
-        of_one = f"1 x {device}" if machine.gpus else None
-        path = given.out / file_name("packs", device)
-        self._file = ResultsFile(path, "packs", settings, device=of_one)
+        of_one = f"1 x {machine.gpus[0].name}" if machine.gpus else None
+        self._file = results_file(given, "packs", device=of_one)
         self._deadline_s = deadline(given.deadline_s)
 
     def run(self, ways: Sequence[Way]) -> bool:

@@ -124,10 +124,12 @@ class ResultsFile:
             results.update(more)
 
 
-def results_file(given: argparse.Namespace, suite: str, of: str = "") -> ResultsFile:
+def results_file(
+    given: argparse.Namespace, suite: str, of: str = "", *, device: str | None = None
+) -> ResultsFile:
     """The file of a benchmark here, e.g. `seeds-ant-nvidia-h200.json` with `of="-ant"`."""
     path = given.out / file_name(f"{suite}{of}", device_name())
-    return ResultsFile(path, suite, vars(given))
+    return ResultsFile(path, suite, vars(given), device=device)
 
 
 def read_calls(path: Path) -> list[Call]:
