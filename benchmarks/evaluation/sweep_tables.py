@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
-from benchmarks.evaluation.writer import lines, link, markdown, origin
+from benchmarks.evaluation.writer import line_of, lines, markdown
 from benchmarks.records import Call, calls_by_date
 
 PATTERN = "sweeps-nvidia-*.json"
@@ -65,13 +65,12 @@ def same_jobs() -> dict[str, SameJobs]:
     """By what the jobs are and where they ran, in Markdown; in the order of first calls."""
     found: dict[str, SameJobs] = {}
     for number, (call, path) in enumerate(calls_by_date(PATTERN)):
-        line = f"- {link(path.name)}: {origin(call)}"
         for run in call.results["runs"]:
             at_once, backend, *tasks = run["way"].split(", ")
             if run["status"] == "completed":
                 same = found.setdefault(_described(call, tasks), SameJobs([], []))
                 if number not in {one for one, *_ in same.runs}:
-                    same.calls.append(line)
+                    same.calls.append(line_of(path.name, call))
                 same.runs.append((number, f"{at_once}, {backend}", run))
     return found
 

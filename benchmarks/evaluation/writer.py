@@ -78,15 +78,11 @@ def newest(pattern: str, key: Callable[[Call], Any]) -> Calls:
 
 def made_with(calls: Calls, note: Callable[[Any], str] = lambda _: "") -> list[str]:
     """A line for each call: its file, the notes of its keys, and with what it was made."""
-    notes: dict[tuple[Path, str | None], list[str]] = {}
+    found: dict[tuple[str, str | None], tuple[Call, list[str]]] = {}
     for key, (call, path) in calls.items():
-        of_call = notes.setdefault((path, call.date), [])
-        of_call += filter(None, [note(key)])
-    made = {(path, call.date): origin(call) for call, path in calls.values()}
-    return [
-        f"- {link(one[0].name)}{', ' * bool(of_call)}{'; '.join(of_call)}: {made[one]}"
-        for one, of_call in notes.items()
-    ]
+        _, notes = found.setdefault((path.name, call.date), (call, []))
+        notes += filter(None, [note(key)])
+    return [line_of(file, call, "; ".join(notes)) for (file, _), (call, notes) in found.items()]
 
 
 def lines(name: str) -> Callable[[MakeLines], MakeLines]:
@@ -114,20 +110,16 @@ def markdown(head: str, rows: Sequence[Sequence[str]]) -> list[str]:
 
 def source(*files: str) -> list[str]:
     """A line for each file: with what its call was made."""
-    below = [
-        *(
-            f"- {link(f'{file}.json')}: {origin(call)}"
-            if (call := call_of(file))
-            else f"- `{file}.json`: {NOT_MEASURED}"
-            for file in files
-        ),
-    ]
+    below = [line_of(f"{file}.json", call_of(file)) for file in files]
     return ["", *below] if below else []
 
 
-def link(file_name: str) -> str:
-    """A file of results, as a page in `docs/evaluation/` points at it."""
-    return f"[`{file_name}`](../../benchmarks/results/{file_name})"
+def line_of(file: str, call: Call | None, note: str = "") -> str:
+    """A call of a file of results, as a page in `docs/evaluation/` points at it."""
+    if call is None:
+        return f"- `{file}`: {NOT_MEASURED}"
+    link = f"[`{file}`](../../benchmarks/results/{file})"
+    return f"- {link}{', ' if note else ''}{note}: {origin(call)}"
 
 
 def origin(call: Call) -> str:
