@@ -64,9 +64,8 @@ def results_of(file: str) -> Mapping[str, Any]:
 
 
 def rate(file: str, case: str, key: str = TRAINING) -> Figure | None:
-    """A figure of the summaries of a case of `<file>.json`."""
-    found = summaries(file, case)
-    return figure([one[key] for one in found if one.get(key) is not None])
+    """A figure of the summaries of a case of `<file>.json`; `key` is a path in them."""
+    return figure([*_at(results_of(file), f"{case}/{key}")])
 
 
 def summaries(file: str, case: str) -> list[Mapping[str, Any]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.cases import SUITES
-from benchmarks.evaluation.figures import figure, rate, shown, summaries
+from benchmarks.evaluation.figures import TRAINING, figure, rate, shown, summaries
 from benchmarks.evaluation.writer import Calls, Rows, table, table_of_calls
 from benchmarks.records import Call, calls_by_date
 
@@ -122,8 +122,10 @@ def playground() -> Rows:
     """What tasks of Playground reach with its own settings, in evaluations without noise."""
     for case in SUITES["playground"]:
         found = summaries("playground", case.name)
-        steps = shown(figure([one["env_steps"] / 1e6 for one in found]), ",.0f")
-        seconds = shown(rate("playground", case.name, "train_wall_s"), ",.0f")
-        last = figure([one["eval"]["last"]["return"] for one in found])
-        rates = shown(rate("playground", case.name), ",.0f")
-        yield [case.name, steps, rates, seconds, shown(last, ",.4g")]
+        steps = figure([one["env_steps"] / 1e6 for one in found])
+        trained, seconds, last = (
+            rate("playground", case.name, key)
+            for key in (TRAINING, "train_wall_s", "eval/last/return")
+        )
+        cells = (shown(one, ",.0f") for one in (steps, trained, seconds))
+        yield [case.name, *cells, shown(last, ",.4g")]

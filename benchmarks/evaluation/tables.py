@@ -238,9 +238,8 @@ def num_env() -> Rows:
         for impl in ("jax", "warp"):
             for envs in (512, 2048, 8192, 32768):
                 name, file = f"{task} {impl} {envs}", f"tasks-{impl}"
-                memory = [one["device"]["peak_memory_mib"] for one in summaries(file, name)]
-                cells = [shown(one, ",.0f") for one in (rate(file, name), figure(memory))]
-                yield [f"`{task}`", f"{envs:,}", impl, *cells]
+                found = rate(file, name), rate(file, name, "device/peak_memory_mib")
+                yield [f"`{task}`", f"{envs:,}", impl, *(shown(one, ",.0f") for one in found)]
 
 
 def small_gmis() -> dict[int, float]:
