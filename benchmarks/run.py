@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.cases import SUITES, Case
-from benchmarks.evaluation.figures import Figure, figure, over, shown
+from benchmarks.evaluation.figures import RATES, Figure, figure, over, shown
 from benchmarks.evaluation.writer import markdown
 from benchmarks.records import ResultsFile
 from benchmarks.runner import as_word, exit_code, failure_of, in_turn, on_free_gpus, options
@@ -26,7 +26,6 @@ from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
 
-RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
 CURVE_POINTS = 60
 
 

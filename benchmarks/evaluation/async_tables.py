@@ -15,45 +15,33 @@ LONG = "async-long"
 KEYS = ("pps", "ttop", WHOLE_RUN)
 RATES, GAINS = ("rounds", "updates"), ("held", "rounds_free", "updates_free")
 
-ASYNC = (
-    ("async-1gpu", "sync, 1 GMI x 8192", "sync, 1 GMI x 8192", ""),
-    ("async-1gpu", "1 agent x 8192 + 1 trainer", "sync, 1 GMI x 8192", ""),
-    ("async-1gpu", "2 agents x 4096 + 1 trainer", "sync, 1 GMI x 8192", ""),
-    ("async-1gpu", "4 agents x 2048 + 1 trainer", "sync, 1 GMI x 8192", ""),
-    *(
-        ("async-2gpu", name, "1 + 1 GPUs, one process each", "1.88 PPS, 1.65 TTOP")
-        for name in ("1 + 1 GPUs, one process each", "1 + 1 GPUs, 4 agents + 2 trainers")
-    ),
-    *(
-        ("async-4gpu", name, "3 + 1 GPUs, one process each", "1.88 PPS, 1.65 TTOP")
-        for name in (
-            *("3 + 1 GPUs, one process each", "3 + 1 GPUs, 4 agents + 2 trainers"),
-            "3 + 1 GPUs, 4 agents + 2 trainers, har, batches of 4 agents",
-        )
-    ),
-)
-"""File, case, what it is compared with, the paper's mean over two and four GPUs."""
+ASYNC = ("async-1gpu", "async-2gpu", "async-4gpu")
+"""Suites; what each begins with is what its others are compared with."""
 
 
 @table(
     "async",
     "ant | PPS: | TTOP: | steps/s of the whole run: | ratios: | the paper's: | return at the end:",
-    *("async-1gpu", "async-2gpu", "async-4gpu"),
+    *ASYNC,
 )
 def asynchronous() -> Rows:
     """Agents and trainers: medians of report lines, and whole runs."""
-    for file, case, base, paper in ASYNC:
-        name = case if case.startswith(("1 +", "3 +")) else f"1 GPU, {case}"
+    cases = [(suite, one.name) for suite in ASYNC for one in SUITES[suite]]
+    for file, case in cases:
+        if "each 3 agents" in case:  # GPUs that do both.
+            continue
+        base = SUITES[file][0].name
         cells = [shown(rate(file, case, key), ",.0f") for key in KEYS]
         gains = [shown(ratio(file, case, base, key)) for key in KEYS]
+        name, paper = case, "1.88 PPS, 1.65 TTOP"  # Its mean over two and four GPUs.
         if case == base:
-            gains, paper = ["1"] * 3, "1" if paper else ""
+            gains, paper = ["1"] * 3, "1"
         if file == "async-1gpu":  # One process that does both has no PPS of its own.
-            gains = ["", shown(ratio(file, case, base)), gains[2]]
-            cells[1] = shown(rate(file, case), ",.0f")
-            cells[0] = "" if case == base else cells[0]
+            name, paper = f"1 GPU, {case}", ""
+            gains = [shown(ratio(file, case, base)), gains[2]]
+            cells[:2] = "" if case == base else cells[0], shown(rate(file, case), ",.0f")
         final = shown(rate(file, case, "final_return"), ",.0f")
-        yield [name, *cells, " / ".join(filter(None, gains)), paper, final]
+        yield [name, *cells, " / ".join(gains), paper, final]
 
 
 @table(

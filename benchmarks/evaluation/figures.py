@@ -11,7 +11,8 @@ from benchmarks.records import RESULTS, Call, read_calls
 from gmijax.errors import ConfigError
 
 NOT_MEASURED = "not measured"
-TRAINING = "step_per_s_train"
+RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
+TRAINING = RATES[-1]
 WHOLE_RUN = "env_steps_per_s"
 
 

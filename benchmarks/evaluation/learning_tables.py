@@ -8,6 +8,7 @@ from typing import Any
 
 from benchmarks.cases import TASKS
 from benchmarks.evaluation.figures import (
+    RATES,
     Figure,
     bounds,
     figure,
@@ -18,7 +19,6 @@ from benchmarks.evaluation.figures import (
 from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
 from benchmarks.records import RESULTS, Call
 
-RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
 MARKS = (
     ("ant", 3000, "20 s", "async-long", "1 GPU, synchronous"),
     ("humanoid", 5000, "under 240 s", "learn-humanoid", "humanoid"),

@@ -236,6 +236,16 @@ def test_a_benchmark_runs_its_commands_and_adds_a_call(
     assert first.results.keys() == second.results.keys()
 
 
+def test_seeds_without_a_row_are_of_one_setting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    arguments, file, commands = ["env=ant", "--seeds", "2"], *BENCHMARKS["seeds"][1:]
+    monkeypatch.setitem(BENCHMARKS, "seeds", (arguments, file, commands))
+    made = Commands()
+    assert run_benchmark("seeds", tmp_path, monkeypatch, made) == 0
+    assert made.made == commands[:1]
+    (call,) = read_calls(tmp_path / f"{file}.json")
+    assert [row["row"] for row in call.results["rows"]] == ["baseline"]
+
+
 @pytest.mark.parametrize("name", ["seeds", "packs"])
 def test_what_is_through_is_kept_when_a_benchmark_is_interrupted(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
