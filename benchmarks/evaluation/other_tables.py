@@ -73,21 +73,30 @@ def backends() -> Rows:
             yield [f"`{task}`", size, *rates, shown(mps_over_share(task, gmis)), NOT_MEASURED]
 
 
-@table(
-    "serving-templates",
+SERVING_HEAD = (
     "GMIs that simulate | `tcg`, steps/s: | `tdg`, steps/s: | T_s, ms: | T_a, ms: | COM, ms: "
-    "| model: | measured:",
-    SERVING,
+    "| model: | measured:"
 )
+
+
+@table("serving-templates", SERVING_HEAD, SERVING)
 def serving_templates() -> Rows:
     """Simulator and agent in one GMI against apart, with the paper's model."""
     calls = reversed(read_calls(RESULTS / f"{SERVING}.json"))
     timed = ([case for case in call.results["cases"] if "simulator_s" in case] for call in calls)
-    for case in next(cases for cases in timed if cases):
-        gain = case["colocated"] / case["dedicated"]
-        rates = (f"{case[key]:,.0f}" for key in ("colocated", "dedicated"))
-        times = (f"{1e3 * case[key]:.2f}" for key in ("simulator_s", "agent_s", "com_s"))
-        yield [case["name"], *rates, *times, f"{predicted_gain(case):.2f}", f"{gain:.2f}"]
+    return [serving_row(case) for case in next(cases for cases in timed if cases)]
+
+
+def serving_row(case: Mapping[str, Any]) -> list[str]:
+    """A case of serving, of which one template may not have been measured."""
+    tcg, tdg = case.get("colocated"), case.get("dedicated")
+    times_s = [case.get(key) for key in ("simulator_s", "agent_s", "com_s")]
+    return [
+        *(case["name"], shown(tcg, ",.0f"), shown(tdg, ",.0f")),
+        *(shown(None if one is None else 1e3 * one) for one in times_s),
+        shown(predicted_gain(case) if "com_s" in case else None),
+        shown(tcg / tdg if tcg and tdg else None),
+    ]
 
 
 def predicted_gain(case: Mapping[str, Any]) -> float:
