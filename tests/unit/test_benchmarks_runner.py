@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import json
+import re
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -288,3 +291,35 @@ def test_a_suite_without_a_case_to_run_is_refused(
     monkeypatch.setattr(sys, "argv", ["run", "--out", str(tmp_path), *arguments])
     assert exit_code(importlib.import_module("benchmarks.run").main) == 2
     assert capsys.readouterr().err.startswith(error)
+
+
+class Taken(Exception):
+    """Its options were taken: it would begin to measure."""
+
+
+def written_commands() -> list[str]:
+    """Of the plan and the documents, what stands behind `python -m benchmarks.`."""
+    root = Path(runner.__file__).parents[1]
+    found = []
+    for path in (root / "benchmarks" / "plan.md", *sorted((root / "docs").rglob("*.md"))):
+        text = path.read_text().replace("\\\n", " ")
+        found += re.findall(r"(?:^|`)python -m benchmarks\.([^`\n]+)", text, re.MULTILINE)
+    return [one for one in dict.fromkeys(found) if " " in one]
+
+
+@pytest.mark.parametrize("command", written_commands())
+def test_commands_that_are_written_down_are_taken(command: str, monkeypatch: pytest.MonkeyPatch):
+    for name in ("parse_args", "parse_intermixed_args"):
+        parse = getattr(argparse.ArgumentParser, name)
+
+        def parsed(self: Any, *given: Any, parse: Any = parse, **named: Any) -> None:
+            parse(self, *given, **named)
+            raise Taken
+
+        monkeypatch.setattr(argparse.ArgumentParser, name, parsed)
+    module, *words = shlex.split(command)
+    if module == "peers":
+        module = "peers.__main__"
+    monkeypatch.setattr(sys, "argv", [module, *words])
+    with pytest.raises(Taken):
+        importlib.import_module(f"benchmarks.{module}").main()
