@@ -18,8 +18,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks.free_gpus import on_free_gpus
 from benchmarks.records import results_file
-from benchmarks.runner import deadline, exit_code, in_turn, on_free_gpus, options, run_command
+from benchmarks.runner import deadline, exit_code, in_turn, options, run_command
 from benchmarks.steady import rate_of_jobs
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.runs.folder import read_json

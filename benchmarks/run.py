@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 from benchmarks.cases import SUITES, Case
 from benchmarks.evaluation.figures import RATES, Figure, figure, over, shown
 from benchmarks.evaluation.writer import markdown
+from benchmarks.free_gpus import on_free_gpus
 from benchmarks.records import ResultsFile
-from benchmarks.runner import as_word, exit_code, failure_of, in_turn, on_free_gpus, options
+from benchmarks.runner import as_word, exit_code, failure_of, in_turn, options
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics

@@ -1,4 +1,4 @@
-"""Runs the commands of benchmarks: in turn, in time, and at the same time where GPUs are free."""
+"""Runs the commands of benchmarks: in turn, in time, several at the same time."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import IO, Any, NamedTuple, TypeVar
 
@@ -28,8 +26,6 @@ STOP_S = 15.0
 _ROOT = Path(__file__).resolve().parents[1]
 
 Case = TypeVar("Case", bound=Hashable)
-Turn = TypeVar("Turn")
-Made = TypeVar("Made")
 
 
 def options(prog: str, about: str | None) -> argparse.ArgumentParser:
@@ -201,57 +197,3 @@ def failure_of(command: Sequence[str], folder: Path | None = None) -> str | None
 def as_word(text: str) -> str:
     """Letters and digits only: a name of a folder that is a value on a command line."""
     return re.sub(r"[^a-zA-Z0-9]+", "-", text)
-
-
-class FreeGpus:
-    """The GPUs that are free, by index; usable from any thread."""
-
-    def __init__(self, count: int) -> None:
-        self._free = set(range(count))
-        self._changed = threading.Condition()
-
-    @contextmanager
-    def taken(self, count: int = 1) -> Iterator[tuple[int, ...]]:
-        """Takes `count` of them once so many are free."""
-        with self._changed:
-            self._changed.wait_for(lambda: len(self._free) >= count)
-            mine = sorted(self._free)[:count]
-            self._free.difference_update(mine)
-        try:
-            yield tuple(mine)
-        finally:
-            with self._changed:
-                self._free.update(mine)
-                self._changed.notify_all()
-
-
-def on_free_gpus(
-    count: int | None,
-    turns: Sequence[Turn],
-    num_gpus: Callable[[Turn], int],
-    run: Callable[[Turn, tuple[int, ...]], Made],
-) -> list[Made]:
-    """Runs all of `turns`, each as soon as so many GPUs are free for it.
-
-    Args:
-      count: of GPUs; None: one after the other in this thread, which signals interrupt, and no
-        GPU is given to any.
-      turns: what is run.
-      num_gpus: how many GPUs one of them needs.
-      run: runs one on GPUs with these indices.
-    """
-    if count is None:
-        return [run(turn, ()) for turn in turns]
-    free = FreeGpus(count)
-
-    def alone(turn: Turn) -> Made:
-        with free.taken(num_gpus(turn)) as gpus:
-            return run(turn, gpus)
-
-    with ThreadPoolExecutor(count) as pool:
-        started = [pool.submit(alone, turn) for turn in turns]
-        try:
-            return [one.result() for one in started]
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise

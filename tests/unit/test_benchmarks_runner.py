@@ -17,8 +17,9 @@ import pytest
 from supervision import machine
 
 from benchmarks import records, runner
+from benchmarks.free_gpus import FreeGpus, on_free_gpus
 from benchmarks.records import read_calls
-from benchmarks.runner import FreeGpus, exit_code, failure_of, in_turn, start, wait_until
+from benchmarks.runner import exit_code, failure_of, in_turn, start, wait_until
 from gmijax.errors import ConfigError
 
 
@@ -82,6 +83,18 @@ def test_free_gpus_are_given_back():
         assert (first, second) == ((0, 1), (2,))
     with free.taken(3) as all_of_them:
         assert all_of_them == (0, 1, 2)
+
+
+def test_turns_get_as_many_gpus_as_they_need_or_none():
+    def run(turn: int, gpus: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
+        if turn > 2:
+            raise ConfigError("needs too many")
+        return turn, gpus
+
+    assert on_free_gpus(None, [1, 2], lambda turn: turn, run) == [(1, ()), (2, ())]
+    assert on_free_gpus(2, [2, 2], lambda turn: turn, run) == [(2, (0, 1))] * 2
+    with pytest.raises(ConfigError, match="needs too many"):
+        on_free_gpus(3, [1, 3], lambda turn: turn, run)
 
 
 @pytest.mark.parametrize(
