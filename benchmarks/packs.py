@@ -106,11 +106,13 @@ class Benchmark:
 
 
 def _curves(jobs: Sequence[dict[str, Any]]) -> list[list[list[float]]]:
-    """Steps and metric of the reports of each job."""
+    """Steps and metric of the reports of each job; none of one that did not start."""
     curves = []
     for job in jobs:
-        lines = (Path(job["run_dir"]) / "pack" / "metrics.jsonl").read_text().splitlines()
-        found = [json.loads(line) for line in lines]
+        path = Path(job["run_dir"]) / "pack" / "metrics.jsonl"
+        found = (
+            [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        )
         curves.append([[one["env_steps"], one["metric"]] for one in found if "metric" in one])
     return curves
 

@@ -18,6 +18,7 @@ from benchmarks.evaluation.figures import (
 )
 from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
 from benchmarks.records import RESULTS, Call
+from benchmarks.walking import SCRIPT
 
 MARKS = (
     ("ant", 3000, "20 s", "async-long", "1 GPU, synchronous"),
@@ -102,28 +103,32 @@ def throughput() -> Rows:
                 yield [f"`{task}`", f"{envs:,}", impl, *cells]
 
 
-def _task_and_start(call: Call) -> tuple[str, str | None, bool]:
+def _kind_of_walking(call: Call) -> tuple[str, str, str | None, bool]:
+    """Task, algorithm of our trainings as it is written, GPU and start."""
     assert call.settings is not None
-    return call.results["task"], call.device, call.settings["cold"]
+    given = dict(word.split("=", 1) for word in call.settings["overrides"])
+    algo = given.get("algo", "ppo").upper()
+    return call.results["task"], algo, call.device, call.settings["cold"]
 
 
 @table_of_calls(
     "walking",
     "task | trained by | programs | seeds that walk: | million steps: | seconds of training: | "
     "seconds of the command: | at the end: million steps: | do not fall: | error, m/s: | rad/s:",
-    lambda: newest("walking-*-nvidia-*.json", _task_and_start),
+    lambda: newest("walking-*-nvidia-*.json", _kind_of_walking),
 )
 def walking(calls: Calls) -> Rows:
     """How long robots are trained until they walk: median, least and most of seeds."""
-    for (task, _, is_cold), (call, _) in sorted(calls.items()):
+    for (task, algo, _, is_cold), (call, _) in sorted(calls.items()):
         start = "compiled anew" if is_cold else "from the cache"
         for trainer, row in call.results["rows"].items():
+            name = trainer if trainer == SCRIPT else f"{trainer} {algo}"
             seeds = f"{row['walk']} of {row['seeds']}"
             spreads = (
                 _spread(row["env_steps"], 1e-6),
                 *(_spread(row[key]) for key in ("training_s", "command_s")),
             )
-            yield [f"`{task}`", trainer, start, seeds, *spreads, *_last_tests(call, trainer)]
+            yield [f"`{task}`", name, start, seeds, *spreads, *_last_tests(call, trainer)]
 
 
 def _last_tests(call: Call, trainer: str) -> Iterator[str]:

@@ -198,9 +198,16 @@ def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypat
     monkeypatch.setattr(records, "RESULTS", tmp_path)
     assert TABLES["walking"]() == [NOT_MEASURED]
     row = {"seeds": 5, "walk": 5, "env_steps": [4e7, 5e7, 6e7]}
-    for is_cold, seconds in ((False, 99.0), (False, 60.0), (True, 100.0)):
+    sac = ["env=go1", "algo=sac"]
+    for is_cold, seconds, given in (
+        (False, 99.0, []),
+        (False, 60.0, ["env=go1"]),
+        (True, 100.0, []),
+        (False, 70.0, sac),
+    ):
         path = tmp_path / "walking-go1-nvidia-h100.json"
-        file = ResultsFile(path, "walking", {"cold": is_cold}, device="H100")
+        settings = {"cold": is_cold, "overrides": given}
+        file = ResultsFile(path, "walking", settings, device="H100")
         spread = {"training_s": [50.0, seconds, 120.0], "command_s": None}
         errors = {"linear_m_per_s": seconds / 1000, "yaw_rad_per_s": None}
         tested = {"env_steps": 7e7, "walk": {"upright": 0.995, "settled": errors}}
@@ -209,10 +216,11 @@ def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypat
             results.update(task="go1", rows={"gmijax": row | spread}, runs=runs)
     lines = TABLES["walking"]()
     rows = [line for line in lines if line.startswith("| `go1`")]
-    walk, share = "5 of 5 | 50 (40 to 60)", "70 | 99.5%"
+    walk, share, most = "5 of 5 | 50 (40 to 60)", "70 | 99.5%", "(50 to 120)"
     assert rows == [
-        f"| `go1` | gmijax | from the cache | {walk} | 60 (50 to 120) |  | {share} | 0.06 |  |",
-        f"| `go1` | gmijax | compiled anew | {walk} | 100 (50 to 120) |  | {share} | 0.10 |  |",
+        f"| `go1` | gmijax PPO | from the cache | {walk} | 60 {most} |  | {share} | 0.06 |  |",
+        f"| `go1` | gmijax PPO | compiled anew | {walk} | 100 {most} |  | {share} | 0.10 |  |",
+        f"| `go1` | gmijax SAC | from the cache | {walk} | 70 {most} |  | {share} | 0.07 |  |",
     ]
 
 
