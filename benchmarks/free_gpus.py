@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TypeVar
+from types import MappingProxyType
+from typing import NamedTuple, TypeVar
+
+from gmijax.machine.snapshot import Machine
 
 Turn = TypeVar("Turn")
 Made = TypeVar("Made")
@@ -64,3 +67,26 @@ def on_free_gpus(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+class Part(NamedTuple):
+    """A GPU with its part of the cores, for a command that is to see no other.
+
+    Attributes:
+      prefix: words before the command.
+      variables: of its environment.
+    """
+
+    prefix: tuple[str, ...] = ()
+    variables: Mapping[str, str] = MappingProxyType({})
+
+
+def part_of(machine: Machine, gpu: int, count: int) -> Part:
+    """The GPU with index `gpu`, where `count` of them are used at the same time."""
+    each = len(machine.cpu_cores) // count
+    cores = machine.cpu_cores[gpu * each : (gpu + 1) * each]
+    device = str(machine.gpus[gpu].index)
+    return Part(
+        ("taskset", "--cpu-list", ",".join(map(str, cores))),
+        {"CUDA_VISIBLE_DEVICES": device, "CUDA_DEVICE_ORDER": "PCI_BUS_ID"},
+    )

@@ -22,6 +22,8 @@ from benchmarks.walking_tests import Policy, policy_of, walks_twice
 from gmijax.config import EnvConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import Machine
 from gmijax.player.policy import PlainPolicy, write_policy
 from gmijax.runs.folder import POLICY, RunPaths, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta
@@ -62,6 +64,41 @@ def test_a_folder_of_trainings_is_not_used_twice(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["walking", *overrides])
     with pytest.raises(ConfigError, match=f"^--runs={tmp_path}: has a gmijax-compile already$"):
         walking.main()
+
+
+def test_every_seed_is_trained_and_tested_on_a_gpu_of_its_own(tmp_path, monkeypatch):
+    gpus = tuple(Gpu(n, f"GPU-{n}", "some GPU", 80000, (9, 0), False) for n in (0, 1))
+    monkeypatch.setattr(walking, "detect_machine", lambda: Machine(gpus, tuple(range(8))))
+    ran = []
+
+    def run_command(command, deadline_s, variables):
+        ran.append((command[2], variables.get("CUDA_VISIBLE_DEVICES"), command))
+        if "benchmarks.walking_tests" in command:
+            asked = read_json(Path(command[-2]))
+            walks = [[{"walks": True}] * len(run) for run in asked["runs"]]
+            write_json(Path(command[-1]), {"walks": walks})
+            return 0
+        own = dict(word.split("=", 1) for word in command if "=" in word)
+        for steps in (10, 20):
+            meta = CheckpointMeta("go1", "ppo", steps, 1, 64, ((8,), (8,)), "warp")
+            save_meta(RunPaths(Path(own["run.dir"])), meta)
+        return 0
+
+    monkeypatch.setattr(walking, "run_command", run_command)
+    given = ("env=go1", "num_envs=64", "--gpus=2", f"--runs={tmp_path}", f"--out={tmp_path}")
+    monkeypatch.setattr("sys.argv", ["walking", *given])
+    assert walking.main() == 0
+    found = {}
+    for cores, gpu, command in ran[1:]:  # The first one compiles, and sees all.
+        assert cores == {"0": "0,1,2,3", "1": "4,5,6,7"}[gpu]
+        found.setdefault(gpu, []).extend(word for word in command if word.startswith("seed="))
+    assert ran[0][1] is None
+    assert found == {"0": ["seed=0", "seed=2", "seed=4"], "1": ["seed=1", "seed=3"]}
+    (path,) = tmp_path.glob("walking-go1-*.json")
+    (call,) = read_calls(path)
+    assert call.device == "1 x some GPU"
+    assert [run["seed"] for run in call.results["runs"]] == [0, 1, 2, 3, 4]
+    assert call.results["rows"]["gmijax"]["walk"] == 5
 
 
 def test_tests_end_with_the_second_in_a_row_that_walks():
