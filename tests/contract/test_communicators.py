@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from pathlib import Path
 
@@ -91,6 +92,86 @@ def test_device_memory_that_one_node_lacks_is_used_by_none(tmp_path: Path) -> No
         assert result["error"] is None, result
         said = "what was written into it; so reduce.strategy=mpr through host memory"
         assert said in (tmp_path / f"stderr_{rank}").read_text()
+
+
+IN_RINGS = [
+    ("flat", "host", [[0], [1]], 1, signal.SIGKILL),
+    ("one_shot", "ipc", [[0, 1], [2, 3]], 2, signal.SIGSTOP),
+    ("one_shot", "ipc", [[0, 1], [2, 3]], 3, signal.SIGKILL),
+    ("har", "ipc", [[0, 1], [2, 3]], 2, signal.SIGKILL),
+]
+
+
+@pytest.mark.parametrize(
+    ("strategy", "intra", "layout", "victim", "number"),
+    IN_RINGS,
+    ids=[f"{strategy}-{layout}-{victim}" for strategy, _, layout, victim, _ in IN_RINGS],
+)
+def test_nodes_exchange_in_rings_and_see_the_end_of_another(
+    strategy: str,
+    intra: str,
+    layout: list[list[int]],
+    victim: int,
+    number: signal.Signals,
+    tmp_path: Path,
+) -> None:
+    """NCCL has a stand-in here; like it, that one waits for ever for who is gone."""
+    options = {"strategy": strategy, "intra": intra, "layout": layout, "inter": "nccl"}
+    sizes = {"num_floats": 4099, "num_calls": 4, "num_ordered_calls": 60, "num_nodes": 2}
+    timeout_s = 4.0 if number == signal.SIGSTOP else 60.0
+    ranks = sum(map(len, layout))
+    with Ranks(
+        tmp_path, ranks, "check_all", goes_on=True, timeout_s=timeout_s, **options, **sizes
+    ).start() as job:
+        job.wait_for("running")
+        checked = [json.loads((tmp_path / f"checked_{rank}").read_text()) for rank in range(ranks)]
+        job.signal(victim, number)
+        left = [rank for rank in range(ranks) if rank != victim]
+        results = dict(zip(left, job.results(*left), strict=True))
+        said = {rank: (tmp_path / f"stderr_{rank}").read_text() for rank in left}
+    assert len({result["digest"] for result in checked}) == 1
+    assert not any("TCP" in text for text in said.values())  # Nobody went another way.
+    assert {r["error"] for r in results.values()} <= {"PeerLost", "CollectiveTimeout"}, results
+    # The leader of the other node watches the leader, and that one its node.
+    at_home = [rank for rank in results if rank >= ranks // 2]
+    leader = ranks // 2
+    for rank, named in [(0, leader), *((rank, victim) for rank in at_home)]:
+        found = results[rank]
+        assert found.get("peer", named) == named, found
+        assert found.get("missing", [named]) == [named], found
+    who_sees_it = results[at_home[0] if at_home else 0]
+    expected = "CollectiveTimeout" if number == signal.SIGSTOP else "PeerLost"
+    assert who_sees_it["error"] == expected, results
+
+
+@pytest.mark.parametrize(
+    ("special", "ways"),
+    [
+        ("without_network", ["ncclSystemError; so nodes exchange by TCP"]),
+        (
+            "forgetful",
+            ["so nodes exchange by TCP", "so reduce.strategy=mpr through host memory"],
+        ),
+    ],
+)
+def test_what_one_rank_lacks_for_rings_over_nodes_is_used_by_none(
+    special: str, ways: list[str], tmp_path: Path
+) -> None:
+    options = {"strategy": "one_shot", "intra": "ipc", "num_calls": 2, "layout": [[0, 1], [2, 3]]}
+    # All members of a ring fail alike.
+    ranks = {"special_rank": 3} if special == "forgetful" else {"special_rank": 0}
+    options |= {"inter": "nccl", "special": special, "host_if_unavailable": True, **ranks}
+    with Ranks(tmp_path, 4, "check_means", num_nodes=2, **options).start(
+        *((0, 1, 3) if special == "without_network" else ())
+    ) as job:
+        if special == "without_network":
+            job.start(2, special_rank=2)
+        results = job.results()
+    assert len({result["digest"] for result in results}) == 1
+    for rank, result in enumerate(results):
+        assert result["error"] is None, result
+        said = (tmp_path / f"stderr_{rank}").read_text()
+        assert all(way in said for way in ways), said
 
 
 def test_a_device_that_takes_no_copies_leaves_exchanges_to_the_host(tmp_path: Path) -> None:
