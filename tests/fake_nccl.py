@@ -85,7 +85,7 @@ class FakeNccl:
 
 def install(*, has_network: bool = True) -> None:
     """Puts it where `nccl_ring` looks, in this process."""
-    sys.modules["nccl.bindings.nccl"] = FakeNccl(has_network=has_network)  # type: ignore[assignment]
+    sys.modules["nccl.bindings.nccl"] = FakeNccl(has_network=has_network)
 
 
 def _at(address: int, num_floats: int) -> np.ndarray:
