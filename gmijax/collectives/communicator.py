@@ -108,12 +108,12 @@ def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lan
             transport = DeviceTransport(control, host, layout, num_floats, parts, device)
         ranks = host.rank, host.world_size
         all_reduce = StagedAllReduce(transport, parts, *ranks)
-        # What is inside of nodes comes first: a rank that finds that it does not work must not
-        # leave other nodes waiting for a sum.
-        checked = [inside_nodes(parts, layout)]
-        if config.inter == "nccl":
-            checked.append(parts)
-        trials = [StagedAllReduce(transport, part, *ranks).is_right for part in checked if part]
+        inside = inside_nodes(parts, layout)
+        trials = [all_reduce.is_right]
+        if len(inside) < len(parts):
+            # A rank that finds that it does not work must not leave other nodes waiting for a sum.
+            first = StagedAllReduce(transport, inside, *ranks).is_right
+            trials = [first, *trials] if config.inter == "nccl" else [first]
         transport.start(trials)
     except BaseException as error:
         if transport is not None:
