@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from pathlib import Path
 
 import pytest
 
 from gmijax.collectives.strategies import COSTS
-from tests.communicator_contract import PAIRS, Case, check_contract
+from tests.communicator_contract import (
+    PAIRS,
+    RINGS_OVER_NODES,
+    Case,
+    RingsOverNodes,
+    check_contract,
+    check_rings_over_nodes,
+)
 from tests.rank_processes import Ranks
 
 pytestmark = pytest.mark.timeout(200)
@@ -94,54 +100,12 @@ def test_device_memory_that_one_node_lacks_is_used_by_none(tmp_path: Path) -> No
         assert said in (tmp_path / f"stderr_{rank}").read_text()
 
 
-IN_RINGS = [
-    ("flat", "host", [[0], [1]], 1, signal.SIGKILL),
-    ("one_shot", "ipc", [[0, 1], [2, 3]], 2, signal.SIGSTOP),
-    ("one_shot", "ipc", [[0, 1], [2, 3]], 3, signal.SIGKILL),
-    ("har", "ipc", [[0, 1], [2, 3]], 2, signal.SIGKILL),
-]
-
-
-@pytest.mark.parametrize(
-    ("strategy", "intra", "layout", "victim", "number"),
-    IN_RINGS,
-    ids=[f"{strategy}-{layout}-{victim}" for strategy, _, layout, victim, _ in IN_RINGS],
-)
+@pytest.mark.parametrize("case", RINGS_OVER_NODES, ids=str)
 def test_nodes_exchange_in_rings_and_see_the_end_of_another(
-    strategy: str,
-    intra: str,
-    layout: list[list[int]],
-    victim: int,
-    number: signal.Signals,
-    tmp_path: Path,
+    case: RingsOverNodes, tmp_path: Path
 ) -> None:
     """NCCL has a stand-in here; like it, that one waits for ever for who is gone."""
-    options = {"strategy": strategy, "intra": intra, "layout": layout, "inter": "nccl"}
-    sizes = {"num_floats": 4099, "num_calls": 4, "num_ordered_calls": 60, "num_nodes": 2}
-    timeout_s = 4.0 if number == signal.SIGSTOP else 60.0
-    ranks = sum(map(len, layout))
-    with Ranks(
-        tmp_path, ranks, "check_all", goes_on=True, timeout_s=timeout_s, **options, **sizes
-    ).start() as job:
-        job.wait_for("running")
-        checked = [json.loads((tmp_path / f"checked_{rank}").read_text()) for rank in range(ranks)]
-        job.signal(victim, number)
-        left = [rank for rank in range(ranks) if rank != victim]
-        results = dict(zip(left, job.results(*left), strict=True))
-        said = {rank: (tmp_path / f"stderr_{rank}").read_text() for rank in left}
-    assert len({result["digest"] for result in checked}) == 1
-    assert not any("TCP" in text for text in said.values())  # Nobody went another way.
-    assert {r["error"] for r in results.values()} <= {"PeerLost", "CollectiveTimeout"}, results
-    # The leader of the other node watches the leader, and that one its node.
-    at_home = [rank for rank in results if rank >= ranks // 2]
-    leader = ranks // 2
-    for rank, named in [(0, leader), *((rank, victim) for rank in at_home)]:
-        found = results[rank]
-        assert found.get("peer", named) == named, found
-        assert found.get("missing", [named]) == [named], found
-    who_sees_it = results[at_home[0] if at_home else 0]
-    expected = "CollectiveTimeout" if number == signal.SIGSTOP else "PeerLost"
-    assert who_sees_it["error"] == expected, results
+    check_rings_over_nodes(case, tmp_path)
 
 
 @pytest.mark.parametrize(
