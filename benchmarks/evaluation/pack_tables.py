@@ -37,6 +37,11 @@ class _Training:
         alone = next((one for one in self.ways if one.startswith("1 ")), "")
         return over(self.rate(way, key), self.rate(alone, key))
 
+    def last_metric(self, way: str) -> Figure | None:
+        """The last one that jobs of a way printed, over all of them."""
+        curves = [curve for row in self.ways[way] for curve in row.get("curves") or ()]
+        return figure([curve[-1][1] for curve in curves if curve])
+
 
 def _succeeded(call: Call) -> list[Mapping[str, Any]]:
     return [row for row in call.results.get("rows", ()) if row.get("exit_code") == 0]
@@ -50,7 +55,8 @@ def _of_trainings() -> Calls:
 
 @table_of_calls(
     "packs",
-    "training | at once | steps/s while all report: | over one: | trainings per hour: | over one:",
+    "training | at once | steps/s while all report: | over one: | trainings per hour: | "
+    "over one: | reward at the end:",
     _of_trainings,
 )
 def packs(calls: Calls) -> Rows:
@@ -58,6 +64,7 @@ def packs(calls: Calls) -> Rows:
     for name, (call, _) in calls.items():
         training = _Training(call, name)
         rows = [row for rows in training.ways.values() for row in rows]
+        has_curves = any(row.get("curves") for row in rows)
         is_mix = not all(are_alike(row["jobs"]) for row in rows)  # Its steps do not add up.
         for number, way in enumerate(training.ways):
             cells = [
@@ -67,6 +74,7 @@ def packs(calls: Calls) -> Rows:
                 ),
                 shown(training.rate(way, _FINISHED), ",.1f"),
                 shown(training.over_one(way, _FINISHED)),
+                shown(training.last_metric(way), ".1f") if has_curves else "",
             ]
             yield ["" if number else name, way, *(["", ""] if is_mix else cells[:2]), *cells[2:]]
 
