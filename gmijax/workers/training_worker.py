@@ -237,6 +237,7 @@ def _trainers_communicator(
         timeout_s=config.reduce.timeout_s,
         rendezvous_timeout_s=config.run.start_timeout_s,
         intra=plan.intra,
+        inter=plan.inter,
         # Whoever asks for it by name is told that it does not work.
         host_if_unavailable=config.reduce.strategy != "one_shot",
         nodes=nodes,
@@ -247,9 +248,10 @@ def _trainers_communicator(
 
 def exchange_used(plan: Plan, comm: Communicator) -> dict[str, str]:
     """For the summary: the exchange in use, where it may differ from the plan's strategy."""
+    used = {} if comm.inter is None else {"inter": comm.inter}
     if comm.strategy != plan.strategy:
-        return {"strategy": comm.strategy, "intra": "host"}
-    return {"intra": comm.intra} if plan.strategy == "har" else {}
+        return {"strategy": comm.strategy, "intra": "host", **used}
+    return {"intra": comm.intra, **used} if plan.strategy == "har" else used
 
 
 def _neighbours(plan: Plan, gmi: int, role: str) -> tuple[int, ...]:
