@@ -67,8 +67,8 @@ class Trainer:
         self._update = make_update(self._learner, self.comm)
         self._env_steps = 0
         self._updates = 0
-        traced = self.config.run.profiled if self.comm.rank == 0 else None
-        self._trace = IterationTrace(traced, self.link.run.profile)
+        traced, leads = self.config.run.profiled, self.comm.rank == 0
+        self._trace = IterationTrace(traced, self.link.run.profile, is_written=leads)
         self._version = 0
         self._passed_over = np.zeros(MAX_COUNTED + 1, np.float32)
 

@@ -14,13 +14,19 @@ import jax
 class IterationTrace:
     """Traces this process, its device included, from one iteration to another one.
 
+    All ranks of a job have one and call it in every iteration, those that do not write too: to
+    wait for a device can be a step that all ranks do together.
+
     Args:
       wanted: the first and the last iteration, counted from 1; None: nothing is traced.
       folder: where the trace is written, in the layout of TensorBoard's profile plugin.
+      is_written: whether this rank is the one that is traced.
     """
 
-    def __init__(self, wanted: tuple[int, int] | None, folder: Path) -> None:
-        self._wanted, self._folder = wanted, folder
+    def __init__(
+        self, wanted: tuple[int, int] | None, folder: Path, *, is_written: bool = True
+    ) -> None:
+        self._wanted, self._folder, self._is_written = wanted, folder, is_written
         self._traced: tuple[int, int] | None = None
         self._is_open = False
         self._error: str | None = None
@@ -33,7 +39,8 @@ class IterationTrace:
             return
         if iteration == self._wanted[0]:
             wait()  # Or the trace would begin with what is left of the iteration before.
-            self._try(self._open)
+            if self._is_written:
+                self._try(self._open)
         if self._is_open:
             self._traced = self._wanted[0], iteration
             # By this name and number the viewers find the steps.
@@ -64,11 +71,11 @@ class IterationTrace:
             self._writing.start()
 
     def outcome(self) -> dict[str, Any] | None:
-        """First and last iteration, folder and error; None where nothing was asked for.
+        """First and last iteration, folder and error; None where nothing was to be written.
 
         The iterations are None where the run never came there.
         """
-        if self._wanted is None:
+        if self._wanted is None or not self._is_written:
             return None
         return {"iterations": self._traced, "dir": str(self._folder), "error": self._error}
 

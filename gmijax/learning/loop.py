@@ -86,8 +86,11 @@ class TrainingLoop:
             self._evaluator = Evaluator(envs, learner, config, comm, members.first.run)
         self._env_steps = self._iterations = 0
         self._saver = CheckpointSaver(link.gmi, comm, config.run.keep_checkpoints)
-        traced = config.run.profiled if self._is_leader and members.is_one else None
-        self._trace = IterationTrace(traced, members.first.run.profile)
+        self._trace = IterationTrace(
+            config.run.profiled if members.is_one else None,
+            members.first.run.profile,
+            is_written=self._is_leader,
+        )
 
     def run(self) -> None:
         """Trains until `num_timesteps` or until the controller asks for an end.

@@ -6,6 +6,7 @@ each worker. Learning (`-k learning`) wants the GPUs for itself: a job takes mos
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -122,6 +123,22 @@ def test_learning_does_not_depend_on_the_strategy(
         for found, array in zip(trained(way), expected, strict=True):
             # Each update moves a parameter by 3e-4 at most.
             np.testing.assert_allclose(found, array, rtol=1e-4, atol=3e-6, err_msg=way)
+
+
+@pytest.mark.timeout(300)
+def test_iterations_of_one_of_two_gmis_are_traced_for_a_profile(tmp_path: Path) -> None:
+    """Both wait for the traced iterations, which is a step of their devices."""
+    _require("ipc")
+    (tmp_path / "point.py").write_text(POINT_TASK)
+    [gpu] = _gpus(1)
+    plan = (f"plan.gpus=[{gpu}]", "plan.gmis_per_gpu=2", "reduce.strategy=one_shot")
+    steps = ("num_timesteps=768", "run.profile=2:3", "run.dir=run")
+    done = train("env=point.py:make", *TINY[1:], *plan, *steps, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["plan"]["strategy"], summary["plan"]["intra"]) == ("one_shot", "ipc")
+    assert summary["profile"]["iterations"] == [2, 3]
+    assert list((tmp_path / "run").glob("profile/plugins/profile/*/perfetto_trace.json.gz"))
 
 
 @pytest.mark.timeout(300)

@@ -15,6 +15,7 @@ import pytest
 from training_jobs import (
     FOREVER,
     POINT,
+    POINT_TASK,
     STEPS,
     gmi_pid,
     iteration_of,
@@ -196,10 +197,36 @@ def test_iterations_of_the_leader_are_traced_for_a_profile(two_gmis: Path) -> No
     check_profile(two_gmis)
 
 
+AS_ON_GPUS = (
+    POINT_TASK
+    + """
+from fake_device_memory import FAKES
+from gmijax.collectives import communicator
+
+communicator.DEVICE = lambda: FAKES["fake"]
+"""
+)
+"""The task, in processes whose GMIs run steps of all as those on GPUs do."""
+
+
 @pytest.mark.timeout(300)
-def test_iterations_of_a_trainer_are_traced_for_a_profile(tmp_path: Path) -> None:
-    steps = f"num_timesteps={12 * 2 * STEPS}"
-    done = train(*POINT, "algo=a3c", steps, "run.profile=2:3", "run.dir=run", cwd=tmp_path)
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("plan.gpus=2", f"num_timesteps={5 * 2 * STEPS}"),
+        (
+            *("algo=a3c", "plan.gpus=3", "plan.serving_gpus=[0]", "plan.training_gpus=[1,2]"),
+            f"num_timesteps={12 * 2 * STEPS}",
+        ),
+    ],
+    ids=["ppo", "a3c"],
+)
+def test_iterations_of_one_of_two_trainers_are_traced_for_a_profile(
+    options: tuple[str, ...], tmp_path: Path
+) -> None:
+    (tmp_path / "point.py").write_text(AS_ON_GPUS)
+    way = ("reduce.strategy=flat", "reduce.timeout_s=20", "run.profile=2:3", "run.dir=run")
+    done = train(*POINT, *options, *way, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert re.search(PROFILED, done.stdout)
     check_profile(tmp_path / "run")

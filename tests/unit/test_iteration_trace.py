@@ -70,6 +70,21 @@ def test_a_run_that_never_comes_there_says_so(tmp_path: Path):
     assert not (tmp_path / "profile").exists()
 
 
+def test_all_ranks_wait_in_the_same_iterations(tmp_path: Path):
+    """What they wait for can be a step of all, which the others would take for another one."""
+
+    def waits(name: str, *, is_written: bool) -> list[int]:
+        trace, found = IterationTrace((2, 4), tmp_path / name, is_written=is_written), []
+        for iteration in range(1, 6):
+            trace.begin(iteration, lambda: found.append(iteration))  # noqa: B023
+            trace.end(iteration, lambda: found.append(-iteration))  # noqa: B023
+        trace.close()
+        assert (trace.outcome() is not None) == (tmp_path / name).exists() == is_written
+        return found
+
+    assert waits("one", is_written=True) == waits("other", is_written=False) == [2, -4]
+
+
 def test_without_the_key_nothing_is_noted(tmp_path: Path):
     assert _trained(IterationTrace(None, tmp_path), 2) == {}
 
