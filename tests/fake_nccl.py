@@ -51,20 +51,20 @@ class FakeComm:
 
 
 class FakeNccl:
-    """What a ring uses of the module `nccl.bindings.nccl`; without a network it does not start."""
+    """What a ring uses of the module `nccl.bindings.nccl`; see `install` for what may fail."""
 
     DataType, RedOp = SimpleNamespace(Float32=7), SimpleNamespace(Sum=0)
     UniqueId = SimpleNamespace(from_buffer=bytes)
 
-    def __init__(self, *, has_network: bool) -> None:
-        self._has_network = has_network
+    def __init__(self, kind: str) -> None:
+        self._kind = kind
 
     def get_unique_id(self) -> bytes:
         fd = os.memfd_create("fake-nccl", os.MFD_CLOEXEC)
         return struct.pack("=qq", os.getpid(), fd).ljust(128, b"\xff")
 
     def comm_init_rank(self, size: int, unique: bytes, rank: int) -> FakeComm:
-        if not self._has_network:
+        if self._kind == "without_network":
             raise RuntimeError("ncclSystemError")
         return FakeComm(size, unique, rank)
 
@@ -83,9 +83,15 @@ class FakeNccl:
         del comm
 
 
-def install(*, has_network: bool = True) -> None:
-    """Puts it where `nccl_ring` looks, in this process."""
-    sys.modules["nccl.bindings.nccl"] = FakeNccl(has_network=has_network)
+def install(kind: str = "") -> None:
+    """Puts it where `nccl_ring` looks, in this process.
+
+    Args:
+      kind: `without_nccl4py`: it cannot be imported; `without_network`: it does not start.
+    """
+    absent: Any = None  # As Python notes it.
+    found = absent if kind == "without_nccl4py" else FakeNccl(kind)
+    sys.modules["nccl.bindings.nccl"] = found
 
 
 def _at(address: int, num_floats: int) -> np.ndarray:

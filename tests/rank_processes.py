@@ -249,7 +249,7 @@ def use_fake_device(kind: str, *, has_rings: bool) -> None:
     """Lets `intra=ipc` and rings run on the CPU: the real exchange over what is not a GPU's.
 
     Args:
-      kind: a key of `FAKES`, or `without_network`, whose NCCL does not start.
+      kind: a key of `FAKES`, or of what NCCL lacks, see `fake_nccl.install`.
       has_rings: whether rings are those of (a stand-in for) NCCL.
     """
     import fake_device_memory
@@ -258,10 +258,9 @@ def use_fake_device(kind: str, *, has_rings: bool) -> None:
     from gmijax.collectives import communicator
     from gmijax.collectives.device.nccl_ring import nccl_ring
 
-    has_network = kind != "without_network"
-    device = fake_device_memory.FAKES[kind if has_network else "fake"]
+    device = fake_device_memory.FAKES.get(kind, fake_device_memory.FAKES["fake"])
     if has_rings:
-        fake_nccl.install(has_network=has_network)
+        fake_nccl.install(kind)
         device = device._replace(new_ring=nccl_ring)
     communicator.DEVICE = lambda: device
 

@@ -48,7 +48,7 @@ COMPARED: Final = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "op
 
 ON_GPUS: Final = (
     *("jax-cuda12-plugin", "jax-cuda13-plugin", "nvidia-nccl-cu12", "nvidia-nccl-cu13"),
-    *("cuda-bindings", "warp-lang"),
+    *("cuda-bindings", "nccl4py", "warp-lang"),
 )
 """The same for nodes whose GPUs are used; the controller may be on a machine without any."""
 

@@ -109,27 +109,26 @@ def test_nodes_exchange_in_rings_and_see_the_end_of_another(
 
 
 @pytest.mark.parametrize(
-    ("special", "ways"),
+    ("special", "special_ranks", "ways"),
     [
-        ("without_network", ["ncclSystemError; so nodes exchange by TCP"]),
+        # The first of a ring, who makes its id, has all that it needs.
+        ("without_nccl4py", [2], ["import of nccl.bindings.nccl", "so nodes exchange by TCP"]),
+        # All members of a ring fail alike.
+        ("without_network", [0, 2], ["ncclSystemError; so nodes exchange by TCP"]),
         (
-            "forgetful",
+            *("forgetful", [3]),
             ["so nodes exchange by TCP", "so reduce.strategy=mpr through host memory"],
         ),
     ],
 )
-def test_what_one_rank_lacks_for_rings_over_nodes_is_used_by_none(
-    special: str, ways: list[str], tmp_path: Path
+def test_what_some_ranks_lack_for_rings_over_nodes_is_used_by_none(
+    special: str, special_ranks: list[int], ways: list[str], tmp_path: Path
 ) -> None:
     options = {"strategy": "one_shot", "intra": "ipc", "num_calls": 2, "layout": [[0, 1], [2, 3]]}
-    # All members of a ring fail alike.
-    ranks = {"special_rank": 3} if special == "forgetful" else {"special_rank": 0}
-    options |= {"inter": "nccl", "special": special, "host_if_unavailable": True, **ranks}
-    with Ranks(tmp_path, 4, "check_means", num_nodes=2, **options).start(
-        *((0, 1, 3) if special == "without_network" else ())
-    ) as job:
-        if special == "without_network":
-            job.start(2, special_rank=2)
+    options |= {"inter": "nccl", "special": special, "host_if_unavailable": True}
+    with Ranks(tmp_path, 4, "check_means", num_nodes=2, **options) as job:
+        for rank in range(4):
+            job.start(rank, special_rank=rank if rank in special_ranks else None)
         results = job.results()
     assert len({result["digest"] for result in results}) == 1
     for rank, result in enumerate(results):

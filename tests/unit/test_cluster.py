@@ -249,15 +249,16 @@ def test_a_node_with_another_gmijax_says_so_before_all_else(
     assert isinstance(node.facts(str(own_versions()["gmijax"])), Facts)
 
 
-def test_packages_for_gpus_are_compared_between_nodes_that_have_some() -> None:
+@pytest.mark.parametrize("package", ["cuda-bindings", "nccl4py"])
+def test_packages_for_gpus_are_compared_between_nodes_that_have_some(package: str) -> None:
     versions = {**own_versions(), "jax-cuda13-plugin": "0.9"}
     facts = [
-        Facts(name, machine(1), versions | {"cuda-bindings": bindings})
-        for name, bindings in (("a", "13.0"), ("b", "13.1"))
+        Facts(name, machine(1), versions | {package: number})
+        for name, number in (("a", "13.0"), ("b", None))
     ]
     nodes = [NodeHandle(RemoteNode(a_node().call, 0, one.address), one) for one in facts]
     require_alike(nodes[:1])
-    with pytest.raises(ConfigError, match=r"differ in cuda-bindings: 13\.0 on a; 13\.1 on b;"):
+    with pytest.raises(ConfigError, match=rf"differ in {package}: 13\.0 on a; none on b;"):
         require_alike(nodes)
     without = [NodeHandle(one.remote, one.facts._replace(machine=machine(0))) for one in nodes]
     require_alike(without)

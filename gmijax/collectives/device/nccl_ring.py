@@ -56,9 +56,10 @@ def nccl_ring(group: Group, rings: Groups) -> NcclRing | None:
     members = next((ring for ring in rings if rank in ring), ())
 
     def make_id() -> bytes:
-        if not members or members[0] != rank:
+        if not members:
             return b""
-        return bytes(_nccl().get_unique_id())
+        nccl = _nccl()  # By all members: who cannot import it must not leave others in `join`.
+        return bytes(nccl.get_unique_id()) if members[0] == rank else b""
 
     def join() -> bytes:
         if members:
