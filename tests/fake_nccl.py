@@ -69,6 +69,8 @@ class FakeNccl:
         return FakeComm(size, unique, rank)
 
     def all_reduce(self, source: int, target: int, count: int, *rest: Any) -> None:
+        if self._kind == "broken_network":
+            raise RuntimeError("ncclRemoteError")
         with np.errstate(over="ignore", invalid="ignore"):
             _at(target, count)[:] = rest[2].gathered(source, count).sum(axis=0)
 
@@ -80,14 +82,20 @@ class FakeNccl:
         _at(target, count)[:] = rest[2].gathered(source, count)[0]
 
     def comm_destroy(self, comm: FakeComm) -> None:
+        self.comm_abort(comm)
+
+    def comm_abort(self, comm: FakeComm) -> None:
         del comm
+        if self._kind == "broken_network":  # It says again what went wrong before.
+            raise RuntimeError("ncclRemoteError")
 
 
 def install(kind: str = "") -> None:
     """Puts it where `nccl_ring` looks, in this process.
 
     Args:
-      kind: `without_nccl4py`: it cannot be imported; `without_network`: it does not start.
+      kind: `without_nccl4py`: it cannot be imported; `without_network`: it does not start;
+        `broken_network`: it adds nothing up.
     """
     absent: Any = None  # As Python notes it.
     found = absent if kind == "without_nccl4py" else FakeNccl(kind)

@@ -124,7 +124,8 @@ class DeviceTransport(HostTransport):
                 self._ipc = self._new_ipc(layout, stages, device.new_memory)
             if (new_ring := device.new_ring) is not None:
                 rings = {stage.groups for stage in stages if stage.transport == "ring"}
-                self._rings = {groups: new_ring(control, groups) for groups in sorted(rings)}
+                for groups in sorted(rings):  # One by one: those before one that fails are closed.
+                    self._rings[groups] = new_ring(control, groups)
         except BaseException:
             self.close()
             raise

@@ -115,6 +115,7 @@ def test_nodes_exchange_in_rings_and_see_the_end_of_another(
         ("without_nccl4py", [2], ["import of nccl.bindings.nccl", "so nodes exchange by TCP"]),
         # All members of a ring fail alike.
         ("without_network", [0, 2], ["ncclSystemError; so nodes exchange by TCP"]),
+        ("broken_network", [0, 2], ["ncclRemoteError; so nodes exchange by TCP"]),
         (
             *("forgetful", [3]),
             ["so nodes exchange by TCP", "so reduce.strategy=mpr through host memory"],

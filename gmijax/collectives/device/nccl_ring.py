@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import sys
+from contextlib import suppress
 from typing import Any
 
 from gmijax.collectives.all_or_none import Group, all_or_none
@@ -36,10 +38,17 @@ class NcclRing:
         self._nccl.broadcast(source, target, num_floats, *kind, self._comm, stream)
 
     def close(self) -> None:
-        """Gives the communicator back. Idempotent."""
-        if self._comm is not None:
-            self._nccl.comm_destroy(self._comm)
-        self._comm = None
+        """Gives the communicator back, at once if an error is what ends it. Idempotent.
+
+        What NCCL then says of the communicator is not news: who waited for a sum has heard it.
+        """
+        comm, self._comm = self._comm, None
+        if comm is None:
+            return
+        # To destroy one may wait for the other members, of whom some may not have joined.
+        give_back = self._nccl.comm_destroy if sys.exception() is None else self._nccl.comm_abort
+        with suppress(Exception):
+            give_back(comm)
 
 
 def nccl_ring(group: Group, rings: Groups) -> NcclRing | None:
@@ -70,7 +79,12 @@ def nccl_ring(group: Group, rings: Groups) -> NcclRing | None:
         return b""
 
     ids = all_or_none(group, _WISH, make_id)
-    all_or_none(group, _WISH, join)
+    try:
+        all_or_none(group, _WISH, join)
+    except BaseException:
+        for ring in joined:
+            ring.close()
+        raise
     return joined[0] if joined else None
 
 
