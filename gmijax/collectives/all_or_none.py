@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -40,8 +41,7 @@ def all_or_none(group: Group, what: str, step: Callable[[], bytes]) -> npt.NDArr
         note, has_failed = step(), False
     # Whatever it is, of CUDA, of jax or of an import: there is another way, through the host.
     except Exception as error:
-        message = " ".join(str(error).split())
-        note, has_failed = f"{message or type(error).__name__}".encode()[:NOTE_BYTES], True
+        note, has_failed = warn_of(what, error).encode()[:NOTE_BYTES], True
     sent = np.zeros(1 + NOTE_BYTES, np.float32)  # One number a byte: no float has odd bits.
     sent[0] = 1 + local.ids[local.rank] if has_failed else 0
     sent[1 : 1 + len(note)] = np.frombuffer(note, np.uint8)
@@ -52,3 +52,14 @@ def all_or_none(group: Group, what: str, step: Callable[[], bytes]) -> npt.NDArr
         gmi = int(rows[failed[0], 0]) - 1
         raise DeviceMemoryUnavailable(f"{what}: GMI {gmi}: {why}")
     return notes
+
+
+def warn_of(what: str, error: Exception) -> str:
+    """Warns of what failed on this rank, at once; the error in words.
+
+    The others may never hear of it: they may wait in NCCL, which has no limit of time.
+    """
+    message = " ".join(str(error).split()) or type(error).__name__
+    # Of this line, so that Python shows it once, although it is an answer of a later step too.
+    warnings.warn(f"{what}: {message}", RuntimeWarning, stacklevel=1)
+    return message

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.all_or_none import Group, all_or_none
+from gmijax.collectives.all_or_none import Group, all_or_none, warn_of
 from gmijax.collectives.device.device_memory import NewMemory
 from gmijax.collectives.device.ipc_buffers import IpcBuffers
 from gmijax.collectives.device.lockstep import LockstepRunner
@@ -231,6 +231,7 @@ class DeviceTransport(HostTransport):
                 raise RuntimeError("shared GPU memory does not hold what was written into it")
         except Exception as error:  # Whatever it is, the host can take part instead.
             flags[self._here.rank, 0] = _FREE  # The others' devices wait for it.
+            warn_of(_WISH, error)
             return error
         return None
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from pathlib import Path
 
 import pytest
+from training_jobs import wait_until
 
 from gmijax.collectives.strategies import COSTS
 from tests.communicator_contract import (
@@ -136,6 +138,25 @@ def test_what_some_ranks_lack_for_rings_over_nodes_is_used_by_none(
         assert result["error"] is None, result
         said = (tmp_path / f"stderr_{rank}").read_text()
         assert all(way in said for way in ways), said
+
+
+@pytest.mark.parametrize(
+    ("special", "said"),
+    [
+        ("without_network", "rings between GPUs: ncclSystemError"),
+        ("broken_network", "exchange on the device's stream: .*ncclRemoteError"),
+    ],
+)
+def test_what_one_member_of_a_ring_lacks_is_said_while_the_others_wait_for_it(
+    special: str, said: str, tmp_path: Path
+) -> None:
+    options = {"inter": "nccl", "layout": [[0], [1]], "num_nodes": 2, "num_calls": 2}
+    options |= {"special_rank": 1, "special": special}
+    with Ranks(tmp_path, 2, "check_means", strategy="flat", **options).start() as job:
+        log = tmp_path / "stderr_1"
+        wait_until(lambda: re.search(said, log.read_text()), 60, "it says why it does not work")
+        assert not job.processes[0].ends_within(0.0)
+        assert log.read_text().count(": RuntimeWarning: ") == 1
 
 
 def test_a_device_that_takes_no_copies_leaves_exchanges_to_the_host(tmp_path: Path) -> None:
