@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from types import ModuleType
 from typing import Any
 
@@ -194,47 +194,76 @@ def test_what_leaders_know_goes_through_a_file() -> None:
         os.close(fd)
 
 
-def test_small_things_go_over_nodes_in_order_of_rank() -> None:
-    layout = Layout.even(1, 2).on_nodes(2)
+@contextmanager
+def ranks_of_two_nodes(layout: Layout, timeout_s: float) -> Iterator[Callable[[int], Any]]:
+    """Makes the communicator of a rank, which is `MultiRankCommunicator`."""
     with ExitStack() as held:
-        listeners = [listen(HERE) for _ in range(2)]
+        listeners = [held.enter_context(listen(HERE)) for _ in range(2)]
         addresses = tuple((HERE, one.getsockname()[1]) for one in listeners)
-        blocks = [create_exchange() for _ in range(2)]
-        for fd in blocks:
-            held.callback(os.close, fd)
+        blocks = [create_exchange() for _ in listeners]
+        for block in blocks:
+            held.callback(os.close, block)
 
-        def gather(rank: int) -> Any:
+        def make(rank: int) -> MultiRankCommunicator:
             node = layout.node_of(rank)
             config = CommunicatorConfig(
                 layout=layout,
                 rank=rank,
                 num_floats=10,
                 exchange_fd=blocks[node],
-                timeout_s=10,
-                rendezvous_timeout_s=10,
+                timeout_s=timeout_s,
+                rendezvous_timeout_s=20,
                 nodes=NodeAddresses(node, addresses, TOKEN),
                 listener=socket.socket(fileno=os.dup(listeners[node].fileno())),
             )
             comm = make_communicator("mpr", config)
             assert isinstance(comm, MultiRankCommunicator)
-            try:
-                # Of all together the last is more than goes through memory at once.
-                sizes = (2, 2, MAX_GATHER_FLOATS // 2)
-                return [
-                    comm.all_gather(np.full(size, rank + k, np.float32))
-                    for k, size in enumerate(sizes)
-                ]
-            finally:
-                met.wait()
-                comm.close()
+            return comm
 
-        met = threading.Barrier(4)
-        for rows in at_once(*(lambda rank=rank: gather(rank) for rank in range(4))):
-            assert [row[:, -1].tolist() for row in rows] == [
-                [k, k + 1, k + 2, k + 3] for k in range(3)
+        yield make
+
+
+def test_small_things_go_over_nodes_in_order_of_rank() -> None:
+    met = threading.Barrier(4)
+
+    def gather(rank: int) -> Any:
+        comm = make(rank)
+        try:
+            # Of all together the last is more than goes through memory at once.
+            sizes = (2, 2, MAX_GATHER_FLOATS // 2)
+            return [
+                comm.all_gather(np.full(size, rank + k, np.float32))
+                for k, size in enumerate(sizes)
             ]
-        for listener in listeners:
-            listener.close()
+        finally:
+            met.wait()
+            comm.close()
+
+    with ranks_of_two_nodes(Layout(((0, 1), (2, 3)), 2), timeout_s=10) as make:
+        found = at_once(*(lambda rank=rank: gather(rank) for rank in range(4)))
+    for rows in found:
+        assert [row[:, -1].tolist() for row in rows] == [
+            [k, k + 1, k + 2, k + 3] for k in range(3)
+        ]
+
+
+def test_a_node_that_is_ready_late_is_waited_for_as_long_as_at_the_start() -> None:
+    """By all ranks of the other node: also those that only wait for their leader."""
+    met = threading.Barrier(4)
+
+    def gather(rank: int) -> Any:
+        comm = make(rank)
+        try:
+            if rank >= 2:
+                time.sleep(2.5)
+            return comm.all_gather(np.full(1, rank, np.float32)).ravel().tolist()
+        finally:
+            met.wait()
+            comm.close()
+
+    with ranks_of_two_nodes(Layout(((0, 1), (2, 3)), 2), timeout_s=1.0) as make:
+        found = at_once(*(lambda rank=rank: gather(rank) for rank in range(4)))
+    assert found == [[0, 1, 2, 3]] * 4
 
 
 @pytest.mark.parametrize(

@@ -102,8 +102,11 @@ class SharedMemoryGroup:
             row[:] = slots[member]
         self.barrier.end()
 
-    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
-        """Returns [K, M]: `values` [M] float32 of every rank, M <= `MAX_GATHER_FLOATS`."""
+    def all_gather(self, values: FloatBuffer, *, while_unresponsive: bool = False) -> FloatBuffer:
+        """Returns [K, M]: `values` [M] float32 of every rank, M <= `MAX_GATHER_FLOATS`.
+
+        For `while_unresponsive` see `Barrier.wait`.
+        """
         if values.dtype != np.float32 or values.ndim != 1 or values.size > MAX_GATHER_FLOATS:
             raise CollectiveError(
                 f"all_gather of {values.dtype} {list(values.shape)}: expected a vector of at "
@@ -113,7 +116,7 @@ class SharedMemoryGroup:
         self.barrier.begin("all_gather", values.size)
         region = block.gathered[self.barrier.step % 2]
         region[self.rank, : values.size] = values
-        self._synchronize()
+        self._synchronize(while_unresponsive=while_unresponsive)
         gathered = region[:, : values.size].copy()
         self.barrier.end()
         return gathered
@@ -170,8 +173,8 @@ class SharedMemoryGroup:
         self._synchronize()
         return slots, _group_of(self.rank, groups)
 
-    def _synchronize(self) -> None:
-        self.barrier.wait()
+    def _synchronize(self, *, while_unresponsive: bool = False) -> None:
+        self.barrier.wait(while_unresponsive=while_unresponsive)
         self.barrier.check_same_call()
 
     def _open_block(self, operation: str) -> SharedBlock:

@@ -78,7 +78,9 @@ class MultiNodeGroup:
             everywhere[:] = self._mesh.all_gather(here.ravel()).ravel()
         for start in range(0, everywhere.size, MAX_GATHER_FLOATS):
             piece = everywhere[start : start + MAX_GATHER_FLOATS]
-            piece[:] = self.local.all_gather(piece)[0]  # The leader is the first of its node.
+            # The leader is the first of its node. While it waits for others the limit is its own,
+            # which in a first call is that of the start.
+            piece[:] = self.local.all_gather(piece, while_unresponsive=True)[0]
         return everywhere.reshape(self.world_size, -1)
 
     def bootstrap_all_gather(self, values: FloatBuffer) -> FloatBuffer:
