@@ -49,8 +49,9 @@ class LockstepRunner:
         barrier.check_same_call()
         with barrier.raise_peer_failure():
             result = self._thread.run(program, barrier.watch)
-        # Some have given it to their devices a step before others.
-        barrier.wait(while_unresponsive=True)
+        # Some have given it to their devices a step before others. Those may be in a ring with
+        # another node; not so after the meeting, when that node may have ended as it should.
+        barrier.wait(while_unresponsive=True, looks_at_nodes=True)
         if isinstance(self._group, MultiNodeGroup):
             self._group.meet_leaders()
             barrier.wait(while_unresponsive=True)

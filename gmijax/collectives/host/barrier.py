@@ -92,20 +92,22 @@ class Barrier:
         word |= (call_index & 0xFFFF) << CALL_INDEX_SHIFT
         self._block.lines["call"][rank, self.step % 2] = word
 
-    def wait(self, *, while_unresponsive: bool = False) -> None:
+    def wait(self, *, while_unresponsive: bool = False, looks_at_nodes: bool = False) -> None:
         """Arrives, and waits until all ranks have arrived here.
 
         What a rank wrote before is visible to all after it, and what it read before is read.
 
         Args:
           while_unresponsive: time only counts while a rank that has not arrived is unresponsive.
+          looks_at_nodes: what a rank has not come out of may be for another node to end, so the
+            leader looks at these too.
 
         Raises:
-          PeerLost: the process of a rank that has not arrived is gone.
+          PeerLost: the process of a rank that has not arrived is gone, or another node.
           CollectiveTimeout: ranks did not arrive in time.
         """
         self._arrive()
-        self._wait(while_unresponsive=while_unresponsive)
+        self._wait(while_unresponsive=while_unresponsive, looks_at_nodes=looks_at_nodes)
 
     def watch(self, done: threading.Event) -> None:
         """Waits for a step that this rank's device runs together with the others'.
@@ -196,9 +198,9 @@ class Barrier:
                     f"{own}, and {sizes[peer]} for {other}"
                 )
 
-    def _wait(self, *, while_unresponsive: bool = False) -> None:
+    def _wait(self, *, while_unresponsive: bool = False, looks_at_nodes: bool = False) -> None:
         target, missing = int(self._sequence[self._block.rank]), self._peers
-        detector = self._detector()
+        detector, since_s = self._detector(), running_s()
 
         def arrived() -> bool | None:
             nonlocal missing
@@ -208,6 +210,8 @@ class Barrier:
         def look() -> None:
             late = partial(self._missing, self._peers, target)
             detector.look(late, while_unresponsive=while_unresponsive)
+            if looks_at_nodes:
+                self._look_at_other_nodes(since_s)
 
         wait_until(arrived, look, math.inf)
         self._fence()
