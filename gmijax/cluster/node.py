@@ -196,7 +196,8 @@ class TrainingNode(Node):
         found = dict(backend.daemons)
         if layout.num_nodes == 1:
             return NodeEndpoints((address, 0), {}, found)
-        if (interface := interface_of(address)) is not None:
+        interface = interface_of(address) if launch.plan.inter == "nccl" else None
+        if interface is not None:
             # By the network of the other exchanges; GMIs inherit it. `=`: this name, no beginning.
             os.environ.setdefault(NCCL_INTERFACE, f"={interface}")
         self._listener = self._held.enter_context(listen(address))

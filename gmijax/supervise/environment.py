@@ -60,8 +60,8 @@ def gmi_environment(
         own = _cpu(allocation, inherited.get(XLA_FLAGS, ""))
     else:
         own = _gpu(allocation)
-        if plan.layout.num_nodes == 1:
-            # All GMIs are on this host, and NCCL's sockets are open to whoever reaches them.
+        if plan.inter != "nccl":
+            # All of a ring are on this host, and NCCL's sockets are open to whoever reaches them.
             defaults[NCCL_INTERFACE] = "lo"
     return {**defaults, **kept, **own, **_common(allocation), **backend_environment}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import dataclasses
 import json
 import os
 import signal
@@ -428,12 +429,18 @@ def test_a_node_starts_polls_and_ends_gmis(
 
 
 @pytest.mark.parametrize(
-    ("users", "address", "expected"),
-    [(None, "127.0.0.1", "=lo"), ("eth1", "127.0.0.1", "eth1"), (None, "192.0.2.1", None)],
+    ("users", "address", "inter", "expected"),
+    [
+        (None, "127.0.0.1", "nccl", "=lo"),
+        ("eth1", "127.0.0.1", "nccl", "eth1"),
+        (None, "192.0.2.1", "nccl", None),
+        (None, "127.0.0.1", "tcp", None),  # Rings stay inside of nodes.
+    ],
 )
 def test_nccl_of_a_node_takes_the_network_of_its_address_unless_the_user_says_another(
     users: str | None,
     address: str,
+    inter: str,
     expected: str | None,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -444,6 +451,7 @@ def test_nccl_of_a_node_takes_the_network_of_its_address_unless_the_user_says_an
     monkeypatch.delenv("NCCL_SOCKET_IFNAME")
     here = {name: machine(0) for name in "ab"}
     plan = make_plan(PlanConfig(), ReduceConfig(), 16, machine(0), nodes=here)
+    plan = dataclasses.replace(plan, inter=inter)
     variables = {} if users is None else {"NCCL_SOCKET_IFNAME": users}
     node = TrainingNode(variables, str(tmp_path), None, address)
     launch = make_launch(RunPaths(tmp_path), ["train", "train"], plan)

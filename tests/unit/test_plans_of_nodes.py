@@ -125,6 +125,17 @@ def test_nccl_between_nodes_listens_where_the_node_says(monkeypatch: pytest.Monk
     assert own.items() <= gmi_environment(plan, 1, own, Path("/cache"), {}).items()
 
 
+def test_rings_inside_of_nodes_stay_on_the_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gmijax.partition.reduction.is_installed", lambda *_: True)
+    here, groups = gpus_of_nodes(2, 2), ("plan.serving_gpus=[0,1]", "plan.training_gpus=[2,3]")
+    config = asynchronous_config("plan.gpus=2", "reduce.strategy=mrr", *groups, nodes=2)
+    trains = training_plan(config, here["10.0.0.0"], nodes=here)
+    assert (trains.strategy, trains.inter) == ("mrr", None)
+    for plan in (trains, dataclasses.replace(trains, inter="tcp")):
+        found = gmi_environment(plan, 1, {}, Path("/cache"), {})
+        assert found["NCCL_SOCKET_IFNAME"] == "lo"
+
+
 def test_a_gpu_of_two_nodes_of_one_machine_has_half_of_its_memory_for_each() -> None:
     nodes = {"a": machine(1), "a#1": machine(1)}
     plan = plan_on(nodes, backend="share", gmis_per_gpu=2)
