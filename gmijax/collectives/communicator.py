@@ -109,12 +109,12 @@ def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lan
         ranks = host.rank, host.world_size
         all_reduce = StagedAllReduce(transport, parts, *ranks)
         inside = inside_nodes(parts, layout)
-        trials = [all_reduce.is_right]
+        checks = [all_reduce.is_right]
         if len(inside) < len(parts):
             # A rank that finds that it does not work must not leave other nodes waiting for a sum.
             first = StagedAllReduce(transport, inside, *ranks).is_right
-            trials = [first, *trials] if config.inter == "nccl" else [first]
-        transport.start(trials)
+            checks = [first, *checks] if config.inter == "nccl" else [first]
+        transport.start(checks)
     except BaseException as error:
         if transport is not None:
             transport.close()

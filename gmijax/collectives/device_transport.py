@@ -143,11 +143,11 @@ class DeviceTransport(HostTransport):
             owners = first[near:] + first[:near]
         return IpcBuffers(self._control, self.capacity, group, owners, new_memory, _WISH)
 
-    def start(self, trials: Sequence[Callable[[], bool]]) -> None:
+    def start(self, checks: Sequence[Callable[[], bool]]) -> None:
         """See `HostTransport`."""
         all_or_none(self._control, _WISH, self._open)
-        for trial in trials:
-            failure = self._runner.finish(partial(self._try, trial))
+        for check in checks:
+            failure = self._runner.finish(partial(self._try, check))
             all_or_none(self._control, _WISH, partial(_raise, failure))
         self.exchange_s()  # Not a part of the first step.
 
@@ -223,11 +223,11 @@ class DeviceTransport(HostTransport):
         self._desync = DesyncDetector(here.flags, here.rank, here.world_size)
         return b""
 
-    def _try(self, trial: Callable[[], bool]) -> Exception | None:
-        """Runs the trial; what went wrong with it."""
+    def _try(self, check: Callable[[], bool]) -> Exception | None:
+        """Runs the check; what went wrong with it."""
         flags = self._here.flags
         try:
-            if not trial() and not (flags[:, 0] == _FREE).any():
+            if not check() and not (flags[:, 0] == _FREE).any():
                 raise RuntimeError("shared GPU memory does not hold what was written into it")
         except Exception as error:  # Whatever it is, the host can take part instead.
             flags[self._here.rank, 0] = _FREE  # The others' devices wait for it.

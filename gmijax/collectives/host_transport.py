@@ -37,11 +37,11 @@ class HostTransport:
         self._exchange_s = 0.0
         self._pinned: dict[str, FloatBuffer] = {}  # On a GPU: what exchanges go through.
 
-    def start(self, trials: Sequence[Callable[[], bool]]) -> None:
+    def start(self, checks: Sequence[Callable[[], bool]]) -> None:
         """Makes sure that it works, together with all other ranks.
 
         Args:
-          trials: collectives, one after the other; whether their results are right.
+          checks: collectives, one after the other; whether their results are right.
 
         Raises:
           DeviceMemoryUnavailable: they do not work; on all ranks alike.

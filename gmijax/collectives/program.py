@@ -69,11 +69,11 @@ class StagedAllReduce:
         """
         assert self._transport is not None
 
-        def trial(values: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def two_sums(values: jax.Array) -> tuple[jax.Array, jax.Array]:
             first = self.sum(values, 1)
             return first, self.sum(values + 1.0, 2, after=first)
 
-        found = jax.jit(trial)(jnp.full(self._transport.capacity, self.rank, jnp.float32))
+        found = jax.jit(two_sums)(jnp.full(self._transport.capacity, self.rank, jnp.float32))
         # Both are read: an error of the device comes with what is read last.
         arrays = [np.asarray(array) for array in found]
         # Small integers are exact in any order.

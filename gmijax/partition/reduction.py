@@ -34,12 +34,11 @@ def select_strategy(layout: Layout) -> Choice:
     """Algorithm 1 of the paper (section 4.1), exactly as printed.
 
     It looks at the layout alone: how many GPUs, and how many GMIs each of them has. On several
-    nodes, of which the paper does not speak, it is the answer for one of them: between nodes
-    one leader of each exchanges, whatever they do inside.
+    nodes, of which the paper does not speak, it is the answer for one of them.
     """
     if layout.num_nodes > 1:
         inside = select_strategy(layout.of_node(0))
-        return inside._replace(why=f"in every node {inside.why}; their leaders exchange")
+        return inside._replace(why=f"in every node {inside.why}")
     num_gpus = layout.num_gpus
     if num_gpus <= 1:
         return Choice("mpr", "all GMIs are on one GPU, so they average in host memory")
@@ -65,7 +64,7 @@ def why_not_strategy(strategy: str, layout: Layout) -> str | None:
     """None if `strategy` can run on `layout`, else the reason in words."""
     if layout.num_nodes == 1 or strategy in ("none", "flat"):
         return STRATEGIES[strategy].why_not(layout)  # One ring may go over all nodes.
-    # It is what each node does inside; whatever that is, their leaders exchange.
+    # It is what each node does inside; `inter` says how nodes exchange, whatever that is.
     reason = STRATEGIES[strategy].why_not(layout.of_node(0))
     return reason and f"in each node {reason}"
 

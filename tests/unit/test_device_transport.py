@@ -129,7 +129,7 @@ def test_a_second_attempt_does_not_begin_with_the_flags_of_the_first(
     ):
         first.start([fails])
     first.close()
-    # The flag by which a failed rank lets the others go would also make any trial a right one.
+    # The flag by which a failed rank lets the others go would also make any check a right one.
     second = new_transport()
     with (
         pytest.warns(RuntimeWarning, match="does not hold what was written"),
