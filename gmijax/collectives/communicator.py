@@ -83,7 +83,9 @@ def make_communicator(strategy: str, config: CommunicatorConfig) -> Communicator
             return _built(strategy, config, control, host)
         except DeviceMemoryUnavailable as error:
             config = replace(config, inter="tcp")
-            warnings.warn(f"{error}; so nodes exchange by TCP", RuntimeWarning, stacklevel=2)
+            # What failed need not be NCCL.
+            instead = "tried again by TCP between nodes instead of NCCL"
+            warnings.warn(f"{error}; {instead}", RuntimeWarning, stacklevel=2)
     try:
         return _built(strategy, config, control, host)
     except DeviceMemoryUnavailable as error:

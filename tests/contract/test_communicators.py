@@ -114,13 +114,28 @@ def test_nodes_exchange_in_rings_and_see_the_end_of_another(
     ("special", "special_ranks", "ways"),
     [
         # The first of a ring, who makes its id, has all that it needs.
-        ("without_nccl4py", [2], ["import of nccl.bindings.nccl", "so nodes exchange by TCP"]),
+        (
+            "without_nccl4py",
+            [2],
+            ["import of nccl.bindings.nccl", "tried again by TCP between nodes instead of NCCL"],
+        ),
         # All members of a ring fail alike.
-        ("without_network", [0, 2], ["ncclSystemError; so nodes exchange by TCP"]),
-        ("broken_network", [0, 2], ["ncclRemoteError; so nodes exchange by TCP"]),
+        (
+            "without_network",
+            [0, 2],
+            ["ncclSystemError; tried again by TCP between nodes instead of NCCL"],
+        ),
+        (
+            "broken_network",
+            [0, 2],
+            ["ncclRemoteError; tried again by TCP between nodes instead of NCCL"],
+        ),
         (
             *("forgetful", [3]),
-            ["so nodes exchange by TCP", "so reduce.strategy=mpr through host memory"],
+            [
+                "tried again by TCP between nodes instead of NCCL",
+                "so reduce.strategy=mpr through host memory",
+            ],
         ),
     ],
 )
