@@ -32,12 +32,12 @@ def new_transport() -> Iterator[NewTransport]:
     """Makes the transport of the only rank, each time over the same shared block."""
     fd, layout = create_exchange(), Layout.even(1, 1)
     times = {"timeout_s": 20.0, "rendezvous_timeout_s": 20.0}
-    lanes = [SharedMemoryGroup(fd, 0, 1, SIZE, lane=lane, **times) for lane in range(LANES)]
+    control, host = (SharedMemoryGroup(fd, 0, 1, SIZE, lane=k, **times) for k in range(LANES))
     os.close(fd)
     parts = stages("one_shot", layout, "ipc")
-    yield lambda: DeviceTransport(*lanes, layout, SIZE, parts, FAKES["fake"])
-    for lane in lanes:
-        lane.close()
+    yield lambda: DeviceTransport(control, host, layout, SIZE, parts, FAKES["fake"])
+    host.close()
+    control.close()
 
 
 class RecordingNccl:
