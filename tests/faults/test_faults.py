@@ -25,7 +25,6 @@ QUICK: tuple[Trial, ...] = (
     ),
     place_faults(("stdout_closed", "stop", "nan", "disk_full"), random.Random(0)),
     Case("train_move", 0),
-    Case("sweep_kill_job", 0),
     *(Case(kind, 0) for kind in ("edit_config_resume", "edit_meta_resume", "edit_summary_again")),
 )
 DECKS = tuple(trial for seed in SEEDS for trial in draw_trials(seed, len(ALL_KINDS), ALL_KINDS))

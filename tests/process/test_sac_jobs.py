@@ -13,6 +13,7 @@ from toy_env import point_mass
 from training_jobs import (
     FOREVER,
     POINT,
+    events,
     gmi_pid,
     kill,
     pids_of,
@@ -84,19 +85,18 @@ def test_every_step_has_its_updates_whoever_is_faster(first: Path) -> None:
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("layout", ["apart", "in turn"])
-def test_either_layout_goes_on_from_its_checkpoint(first: Path, layout: str) -> None:
-    cwd, run = first.parent, first.parent / layout.replace(" ", "_")
-    other = () if layout == "apart" else ("plan.serving_gmis_per_gpu=null",)
-    line = (f"run.resume={first}", f"num_timesteps={120 * UNROLL}", f"run.dir={run.name}")
-    done = train(*line, *other, cwd=cwd)
+def test_one_program_goes_on_from_its_checkpoint(first: Path) -> None:
+    """That two GMIs do, `test_a_job_goes_on_after_each_of_the_two_is_killed` shows."""
+    cwd, run = first.parent, first.parent / "in_turn"
+    line = (f"run.resume={first}", f"num_timesteps={120 * UNROLL}", "run.dir=in_turn")
+    done = train(*line, "plan.serving_gmis_per_gpu=null", cwd=cwd)
     assert done.returncode == 0, done.stderr
     assert "the replay of 256 transitions is not in the checkpoint" in done.stdout
     summary = _summary(run)
-    assert summary["plan"]["template"] == ("decoupled" if layout == "apart" else "tcg_ex")
+    assert summary["plan"]["template"] == "tcg_ex"
     assert summary["env_steps"] == 120 * UNROLL
-    # One program learns from the fourth row on, and not only when all four are there.
-    assert _updates(run) == 120 * 4 * 2 - (0 if layout == "apart" else 3 * 2)
+    # It learns from the fourth row on, and not only when all four are there.
+    assert _updates(run) == 120 * 4 * 2 - 3 * 2
 
 
 @pytest.mark.timeout(300)
@@ -118,30 +118,29 @@ def _wait_for_lines(job: subprocess.Popen[bytes], run: Path, beyond: int) -> int
     return steps()
 
 
-@pytest.mark.timeout(300)
-@pytest.mark.parametrize("victim", [AGENT, LEARNER])
-def test_a_job_goes_on_after_one_of_the_two_is_killed(tmp_path: Path, victim: int) -> None:
+@pytest.mark.timeout(400)
+def test_a_job_goes_on_after_each_of_the_two_is_killed(tmp_path: Path) -> None:
     run, shm = tmp_path / "run", shared_memory()
-    line = (FOREVER, "run.dir=run", "run.checkpoint_every=20", "run.max_restarts=1")
+    line = (FOREVER, "run.dir=run", "run.checkpoint_every=20", "run.max_restarts=2")
     job = start(*SAC, *line, cwd=tmp_path)
     _wait_for_lines(job, run, 0)
     wait_until(lambda: list(run.glob("checkpoints/[0-9]*")), 60, "a checkpoint")
-    kill(gmi_pid(run, victim) or 0)
-    events = run / "events.jsonl"
-    wait_until(lambda: '"recovered"' in events.read_text(), 90, "the job to go on")
-    [again] = [
-        event
-        for event in map(json.loads, events.read_text().splitlines())
-        if event["event"] == "start" and event["attempt"] == 1
-    ]
-    saved = int(Path(again["checkpoint"]).name)
-    _wait_for_lines(job, run, saved + UNROLL)
+    saved = 0
+    for attempt, victim in enumerate((AGENT, LEARNER), start=1):
+        kill(gmi_pid(run, victim) or 0)
+        wait_until(
+            lambda attempt=attempt: len(events(run, "recovered")) == attempt, 90, "it goes on"
+        )
+        again = events(run, "start")[attempt]
+        saved = int(Path(again["checkpoint"]).name)
+        _wait_for_lines(job, run, saved + UNROLL)
     job.send_signal(signal.SIGINT)
     assert job.wait(timeout=90) == 130
     assert pids_of(run) == []
     summary = _summary(run)
-    assert (summary["status"], len(summary["restarts"])) == ("interrupted", 1)
-    assert "SIGKILL" in json.dumps(summary["restarts"])
+    assert (summary["status"], len(summary["restarts"])) == ("interrupted", 2)
+    assert [again["gmi"] for again in summary["restarts"]] == [AGENT, LEARNER]
+    assert json.dumps(summary["restarts"]).count("SIGKILL") >= 2
     assert summary["env_steps"] > saved >= 20 * UNROLL
     assert _updates(run) == summary["env_steps"] // 16 * 2
     require_gone(shared_memory, shm)
