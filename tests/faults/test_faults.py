@@ -20,7 +20,7 @@ from fault_trials import kinds_here, run_trial
 SEEDS = (0, *map(int, filter(None, os.environ.get("GMIJAX_FAULT_SEEDS", "").split(","))))
 QUICK: tuple[Trial, ...] = (
     place_faults(
-        ("stdout_gone", "slow", "kill_named", "raise_part", "checkpoint_copies", "term_all"),
+        ("stdout_gone", "slow", "kill_named", "checkpoint_copies", "term_all"),
         random.Random(0),
     ),
     place_faults(("stdout_closed", "stop", "nan", "disk_full"), random.Random(0)),
