@@ -363,7 +363,7 @@ def test_what_a_node_refuses_is_raised_here_and_does_not_lose_it(
 
     monkeypatch.setattr(FakeHost, "open", refuse)
     monkeypatch.setattr(nodes, "LocalHost", lambda _: FakeHost("b"))
-    here = SweepNode({}, "", None, "10.0.0.2")
+    here = SweepNode({}, "nowhere", None, "10.0.0.2")
 
     class Answer:
         def __init__(self, value: Any) -> None:
