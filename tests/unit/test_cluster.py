@@ -439,7 +439,9 @@ def test_nccl_of_a_node_takes_the_network_of_its_address_unless_the_user_says_an
 ) -> None:
     monkeypatch.setattr(nodes, "detect_machine", lambda: machine(0))
     monkeypatch.setattr(nodes, "listen", lambda _: socket.create_server(("127.0.0.1", 0)))
-    monkeypatch.setenv("NCCL_SOCKET_IFNAME", "")  # So that it is as before after the test.
+    # A node changes both; so that they are as before after the test.
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NCCL_SOCKET_IFNAME", "")
     monkeypatch.delenv("NCCL_SOCKET_IFNAME")
     here = {name: machine(0) for name in "ab"}
     plan = make_plan(PlanConfig(), ReduceConfig(), 16, machine(0), nodes=here)
