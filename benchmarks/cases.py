@@ -63,20 +63,17 @@ def _plan(task: str, gmis: int, num_envs: int) -> Case:
     )
 
 
-def _templates(task: str, num_envs: int) -> tuple[Case, ...]:
+def _templates(task: str) -> tuple[Case, ...]:
     """The same environments in GMIs that do everything, and in GMIs that a third one trains."""
     # A dozen iterations of the longest rollout. Both as the paper has them: gradients through
     # host memory.
     shared = (
-        f"env={task} num_envs={num_envs} num_timesteps={12 * 32 * 2 * num_envs} plan.backend=mps "
+        f"env={task} num_envs=2048 num_timesteps={12 * 32 * 2 * 2048} plan.backend=mps "
         f"{_NO_RATES} {_NO_CHECKPOINTS} reduce.strategy=paper"
     )
     return (
-        _case(f"2 GMIs x {num_envs}, tcg_ex", f"{shared} plan.gmis_per_gpu=2"),
-        _case(
-            f"2 + 1 GMIs x {num_envs}, tdg_ex",
-            f"{shared} plan.gmis_per_gpu=3 plan.template=tdg_ex",
-        ),
+        _case("2 GMIs x 2048, tcg_ex", f"{shared} plan.gmis_per_gpu=2"),
+        _case("2 + 1 GMIs x 2048, tdg_ex", f"{shared} plan.gmis_per_gpu=3 plan.template=tdg_ex"),
     )
 
 
@@ -84,8 +81,8 @@ _ANT = f"env=ant physics.impl=jax {_NO_CHECKPOINTS}"
 _THIRTY = f"{_ANT} num_timesteps=30e6"
 
 
-def _shared(backends: tuple[str, ...], gpus: int, gmis: int, own: str) -> tuple[Case, ...]:
-    """GMIs with 2048 environments each, under backends of a GPU."""
+def _shared(gpus: int, gmis: int, own: str) -> tuple[Case, ...]:
+    """GMIs with 2048 environments each, with and without MPS."""
     where = f"{gpus} GPUs x " if gpus > 1 else ""
     return tuple(
         _case(
@@ -93,7 +90,7 @@ def _shared(backends: tuple[str, ...], gpus: int, gmis: int, own: str) -> tuple[
             f"{own} num_envs=2048 plan.gmis_per_gpu={gmis} plan.backend={backend}",
             gpus,
         )
-        for backend in backends
+        for backend in ("mps", "share")
     )
 
 
@@ -101,24 +98,6 @@ def _async(name: str, gpus: int, num_envs: int, overrides: str = "") -> Case:
     """Agents with `num_envs` environments each, and trainers."""
     own = f"{_ANT} algo=a3c plan.backend=mps channel.capacity_mib=256 num_envs={num_envs}"
     return _case(name, f"{own} num_timesteps=30e6 {overrides}", gpus)
-
-
-def _sac(task: str, updates: int) -> tuple[Case, ...]:
-    """Agents and learner in turn, and in GMIs of their own, with as many updates for each step."""
-    shared = (
-        f"env={task} algo=sac num_envs=4096 algo.updates_per_step={updates} algo.policy_every=2 "
-        "algo.precision=bfloat16 algo.replay_precision=float16 algo.replay_steps=256 "
-        # Time enough for medians, and for a look at what is learnt.
-        f"num_timesteps=12e6 {_NO_RATES} {_NO_CHECKPOINTS}"
-    )
-    return (
-        _case(f"{updates} updates, one program", shared),
-        _case(
-            f"{updates} updates, agent + learner",
-            f"{shared} plan.backend=mps channel.transport=device channel.capacity_mib=256 "
-            "plan.serving_gmis_per_gpu=1",
-        ),
-    )
 
 
 def _on(serving: str, training: str, agents: int, trainers: int) -> str:
@@ -244,16 +223,11 @@ SUITES = MappingProxyType(
         # The same 8192 environments on one GPU: together, and in four GMIs.
         "ant-1gpu": (
             _case("1 GMI x 8192", f"{_THIRTY} num_envs=8192"),
-            *_shared(("mps", "share"), 1, 4, _THIRTY),
+            *_shared(1, 4, _THIRTY),
         ),
-        # Agents and learner of SAC in turn, and beside each other.
-        **{
-            f"sac-{task}": (*_sac(task, 2), *_sac(task, 4))
-            for task in ("ant", "humanoid", "shadow_hand", "go1")
-        },
         # Trainers among their simulators, and in GMIs of their own.
-        **{f"templates-{task}": _templates(task, 2048) for task in ("ant", "humanoid")},
-        "ant-2gpu": _shared(("mps", "share"), 2, 2, f"{_THIRTY} plan.gpus=2 {_NO_RATES}"),
+        **{f"templates-{task}": _templates(task) for task in ("ant", "humanoid")},
+        "ant-2gpu": _shared(2, 2, f"{_THIRTY} plan.gpus=2 {_NO_RATES}"),
         # Every task, both implementations of MJX, one GMI.
         **{
             f"tasks-{impl}": tuple(

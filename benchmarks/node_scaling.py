@@ -105,18 +105,6 @@ def measured() -> Measured:
     return Measured(iterations, found["b1"], found["b2"])
 
 
-class Network(NamedTuple):
-    """Between nodes.
-
-    Attributes:
-      gbit_per_s: of each node in each direction.
-      message_us: what a message costs beside its bytes.
-    """
-
-    gbit_per_s: float
-    message_us: float
-
-
 def table(gbit_per_s: Sequence[float] = GBIT_PER_S, message_us: float = MESSAGE_US) -> list[str]:
     """Predicted efficiencies for both tasks, both ways inside a node, and these networks.
 
@@ -143,10 +131,10 @@ def _cells(
 ) -> Iterator[str]:
     yield f"{gbit_per_s:g}"
     for us, times in ((0.0, 1.0), (message_us, 1.0), (message_us, 10.0)):
-        network = Network(gbit_per_s, us)
-        values = (efficiency(known, task, strategy, nodes, network, times) for nodes in NODES)
+        network = (gbit_per_s, us, times)
+        values = (efficiency(known, task, strategy, nodes, *network) for nodes in NODES)
         yield " / ".join(f"{value:.2f}" for value in values)
-    first = breaks_at(known, task, strategy, Network(gbit_per_s, message_us))
+    first = breaks_at(known, task, strategy, gbit_per_s, message_us)
     yield f"over {MOST_NODES}" if first is None else str(first)
 
 
@@ -155,7 +143,8 @@ def efficiency(
     task: str,
     strategy: str,
     num_nodes: int,
-    network: Network,
+    gbit_per_s: float,
+    message_us: float,
     times: float = 1.0,
 ) -> float:
     """Predicted steps/s of a GPU among all over those of one GPU alone, from 0 to 1.
@@ -167,22 +156,25 @@ def efficiency(
       task: a key of `TRAININGS`.
       strategy: of a node, a key of `COSTS`.
       num_nodes: with eight GPUs each, one GMI on each.
-      network: between them.
+      gbit_per_s: of each node in each direction.
+      message_us: what a message costs beside its bytes.
       times: as long as the model says do exchanges take.
     """
     training, alone_s = TRAININGS[task], known.iteration_s[task]
     layout = Layout.even(GPUS_PER_NODE, 1).on_nodes(num_nodes)
-    b3 = network.gbit_per_s * 1e9 / 8
+    b3 = gbit_per_s * 1e9 / 8
     bytes_s = predicted_s(strategy, layout, training.num_floats, known.b1, known.b2, b3)
-    messages_s = 2 * (num_nodes - 1) * network.message_us * 1e-6
+    messages_s = 2 * (num_nodes - 1) * message_us * 1e-6
     return alone_s / (alone_s + training.exchanges * times * (bytes_s + messages_s))
 
 
-def breaks_at(known: Measured, task: str, strategy: str, network: Network) -> int | None:
+def breaks_at(
+    known: Measured, task: str, strategy: str, gbit_per_s: float, message_us: float
+) -> int | None:
     """The fewest nodes with an efficiency below `ENOUGH`; None if not up to `MOST_NODES`."""
 
     def is_below(nodes: int) -> bool:
-        return efficiency(known, task, strategy, nodes, network) < ENOUGH
+        return efficiency(known, task, strategy, nodes, gbit_per_s, message_us) < ENOUGH
 
     # More nodes are never better.
     first = 1 + bisect_left(range(1, MOST_NODES + 1), True, key=is_below)

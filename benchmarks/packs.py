@@ -15,13 +15,12 @@ import json
 import sys
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.records import ResultsFile, file_name
-from benchmarks.runner import FreeGpus, deadline, exit_code, in_turn, options, run_command
+from benchmarks.free_gpus import Part, on_free_gpus, part_of
+from benchmarks.records import results_file
+from benchmarks.runner import deadline, exit_code, in_turn, options, run_command
 from benchmarks.steady import rate_of_jobs
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.runs.folder import read_json
@@ -46,47 +45,41 @@ class Benchmark:
 
     def __init__(self, given: argparse.Namespace, machine: Machine) -> None:
         self._given, self._machine = given, machine
-        device = machine.gpus[0].name if machine.gpus else "cpu"
-        settings = {**vars(given), "command": list(given.command)}
         # Each row is of one GPU, however many work at the same time.
-        of_one = f"1 x {device}" if machine.gpus else None
-        path = given.out / file_name("packs", device)
-        self._file = ResultsFile(path, "packs", settings, device=of_one)
+        of_one = f"1 x {machine.gpus[0].name}" if machine.gpus else None
+        self._file = results_file(given, "packs", device=of_one)
         self._deadline_s = deadline(given.deadline_s)
-        count = min(given.gpus, len(machine.gpus))
-        self._free = FreeGpus(count) if count > 1 else None
 
     def run(self, ways: Sequence[Way]) -> bool:
         """Whether there was time for all."""
-        if self._free is None:  # In this thread, which signals interrupt.
-            return all([self._repeat(number, ways) for number in range(self._given.repeats)])
-        with ThreadPoolExecutor(self._free.count) as pool:
-            return all([*pool.map(lambda n: self._repeat(n, ways), range(self._given.repeats))])
+        count, repeats = min(self._given.gpus, len(self._machine.gpus)), range(self._given.repeats)
 
-    def _repeat(self, number: int, ways: Sequence[Way]) -> bool:
+        def repeat(number: int, gpus: Sequence[int]) -> bool:
+            part = part_of(self._machine, gpus[0], count) if gpus else Part()
+            return self._repeat(number, ways, part)
+
+        return all(on_free_gpus(count if count > 1 else None, repeats, lambda _: 1, repeat))
+
+    def _repeat(self, number: int, ways: Sequence[Way], part: Part) -> bool:
         num_rows = 0
-        with self._free.taken() if self._free else nullcontext(()) as gpus:
-            for _, way in in_turn(ways, 1, self._deadline_s):
-                row = {"name": self._given.name, "way": str(way), "repeat": number}
-                row |= self._pack(way, gpus)
-                with self._file.changing() as results:
-                    results["rows"] = [*results.get("rows", []), row]
-                sys.stdout.write(f"{json.dumps(row)}\n")
-                sys.stdout.flush()
-                num_rows += 1
+        for _, way in in_turn(ways, 1, self._deadline_s):
+            row = {"name": self._given.name, "way": str(way), "repeat": number}
+            row |= self._pack(way, part)
+            self._file.add("rows", row)
+            print(json.dumps(row), flush=True)
+            num_rows += 1
         return num_rows == len(ways)
 
-    def _pack(self, way: Way, gpus: Sequence[int]) -> dict[str, Any]:
+    def _pack(self, way: Way, part: Part) -> dict[str, Any]:
         given = self._given
         with tempfile.TemporaryDirectory() as folder:
             root = Path(folder) / "pack"
-            prefix, variables = self._kept_to(gpus[0]) if gpus else ((), {})
             command = [
-                *(*prefix, sys.executable, "-m", "gmijax.pack", f"run.dir={root}"),
+                *(*part.prefix, sys.executable, "-m", "gmijax.pack", f"run.dir={root}"),
                 *(f"pack.copies={way.copies}", f"pack.jobs_per_gpu={way.at_once}"),
                 *(f"pack.backend={way.backend}", *given.keys, "--", *given.command),
             ]
-            code = run_command(command, self._deadline_s, variables)
+            code = run_command(command, self._deadline_s, part.variables)
             if not (root / "pack.json").exists():
                 return {"exit_code": code}
             report = read_json(root / "pack.json")
@@ -102,22 +95,15 @@ class Benchmark:
                 "curves": _curves(report["jobs"]) if given.curves else None,
             }
 
-    def _kept_to(self, slot: int) -> tuple[Sequence[str], dict[str, str]]:
-        """Words before a command, and its variables: one GPU with its part of the cores."""
-        cpus, gpus = self._machine.cpu_cores, self._machine.gpus
-        each = len(cpus) // min(self._given.gpus, len(gpus))
-        own = ",".join(map(str, cpus[slot * each : (slot + 1) * each]))
-        device = str(gpus[slot].index)
-        variables = {"CUDA_VISIBLE_DEVICES": device, "CUDA_DEVICE_ORDER": "PCI_BUS_ID"}
-        return ("taskset", "--cpu-list", own), variables
-
 
 def _curves(jobs: Sequence[dict[str, Any]]) -> list[list[list[float]]]:
-    """Steps and metric of the reports of each job."""
+    """Steps and metric of the reports of each job; none of one that did not start."""
     curves = []
     for job in jobs:
-        lines = (Path(job["run_dir"]) / "pack" / "metrics.jsonl").read_text().splitlines()
-        found = [json.loads(line) for line in lines]
+        path = Path(job["run_dir"]) / "pack" / "metrics.jsonl"
+        found = (
+            [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        )
         curves.append([[one["env_steps"], one["metric"]] for one in found if "metric" in one])
     return curves
 

@@ -7,6 +7,7 @@ A file from before this format is read as one call, and what it does not say is 
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import shlex
@@ -116,6 +117,20 @@ class ResultsFile:
             data = {"format": FORMAT, "suite": self.suite}
             write_json(self.path, {**data, "calls": [call._asdict() for call in calls]})
 
+    def add(self, key: str, row: Mapping[str, Any], **more: Any) -> None:
+        """Adds a row to one of the lists in `results`, and what else is known by then."""
+        with self.changing() as results:
+            results.setdefault(key, []).append(row)
+            results.update(more)
+
+
+def results_file(
+    given: argparse.Namespace, suite: str, of: str = "", *, device: str | None = None
+) -> ResultsFile:
+    """The file of a benchmark here, e.g. `seeds-ant-nvidia-h200.json` with `of="-ant"`."""
+    path = given.out / file_name(f"{suite}{of}", device_name())
+    return ResultsFile(path, suite, vars(given), device=device)
+
 
 def read_calls(path: Path) -> list[Call]:
     """The calls in a file, oldest first.
@@ -131,9 +146,9 @@ def read_calls(path: Path) -> list[Call]:
     return [_of_old_file(found)]
 
 
-def calls_by_date(folder: Path, pattern: str) -> list[tuple[Call, Path]]:
-    """The calls in all files of a folder that match, with their files, oldest first."""
-    found = [(call, path) for path in sorted(folder.glob(pattern)) for call in read_calls(path)]
+def calls_by_date(pattern: str) -> list[tuple[Call, Path]]:
+    """The calls in all files of results that match, with their files, oldest first."""
+    found = [(call, path) for path in sorted(RESULTS.glob(pattern)) for call in read_calls(path)]
     return sorted(found, key=lambda one: str(one[0].date))
 
 

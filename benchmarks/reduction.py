@@ -11,9 +11,11 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
+from benchmarks.evaluation.other_tables import REDUCTION_HEAD, reduction_row
+from benchmarks.evaluation.writer import markdown
 from benchmarks.records import ResultsFile, device_name, file_name
 from benchmarks.reduction_jobs import Probe, candidates, measure
 from benchmarks.runner import exit_code, options
@@ -53,11 +55,9 @@ def main() -> int:
     file = ResultsFile(path, "reduction", {**vars(given), "backend": backend})
     with file.changing() as results:
         results.update(measure_all(plans, set(layouts), machine, given))
-    for row in results["rows"]:
-        sys.stdout.write(f"{line(row)}\n")
-    for text in gains(results["rows"]):
-        sys.stdout.write(f"{text}\n")
-    sys.stdout.write(f"written: {path}\n")
+    rows = results["rows"]
+    cells = [[row["layout"], f"{row['num_floats']:,}", *reduction_row(row)] for row in rows]
+    print(*markdown(f"layout | floats: | {REDUCTION_HEAD}", cells), f"written: {path}", sep="\n")
     return 0
 
 
@@ -109,31 +109,6 @@ def plan_of(layout: Layout, backend: Any, machine: Machine) -> Plan:
     """A plan of GMIs that train, for `candidates` and `measure`; raises ConfigError."""
     config = PlanConfig(gpus=layout.num_gpus, layout=layout.gmis_of_gpu, backend=backend)
     return make_plan(config, ReduceConfig(), 1, machine)
-
-
-def line(row: dict[str, Any]) -> str:
-    """One row for people."""
-    predicted = row["predicted_s"]
-    return (
-        f"{row['layout']:18} {row['num_floats']:>9,} {row['name']:9}"
-        f"{'*' if row['is_algorithm_1'] else ' '} {row['median_s'] * 1e3:8.3f} ms"
-        f" ({row['p10_s'] * 1e3:.3f} to {row['p90_s'] * 1e3:.3f}),"
-        f" one of a chain {row['chained_s'] * 1e3:.3f} ms, predicted "
-        f"{'-' if predicted is None else format(predicted * 1e3, '.3f')} ms"
-    )
-
-
-def gains(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """How much faster than MPR the best other way is, for every layout and size."""
-    for layout, size in dict.fromkeys((row["layout"], row["num_floats"]) for row in rows):
-        times = {
-            row["name"]: row["chained_s"]
-            for row in rows
-            if (row["layout"], row["num_floats"]) == (layout, size)
-        }
-        base = times.pop("mpr")
-        best = min(times, key=times.__getitem__)
-        yield f"{layout:18} {size:>9,} {best} is {base / times[best]:.1f} times as fast as mpr"
 
 
 def _row(

@@ -10,24 +10,23 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import math
 import statistics
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.cases import SUITES, Case
+from benchmarks.evaluation.figures import RATES, Figure, figure, over, shown
+from benchmarks.evaluation.writer import markdown
+from benchmarks.free_gpus import on_free_gpus
 from benchmarks.records import ResultsFile
-from benchmarks.runner import FreeGpus, as_word, exit_code, failure_of, in_turn, options
+from benchmarks.runner import as_word, exit_code, failure_of, in_turn, options
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
 
-RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
 CURVE_POINTS = 60
 
 
@@ -53,9 +52,9 @@ def main() -> int:
             for repeat, case in in_turn(cases, given.repeats)
             if case not in large and not is_done(file.results, case, repeat)
         ]
-        run_all(turns, FreeGpus(given.gpus) if given.gpus else None)
+        on_free_gpus(given.gpus or None, turns, lambda turn: turn.case.gpus, _Turn.run)
     for _, file in files:
-        sys.stdout.write(f"{table(file.results)}\nwritten: {file.path}\n")
+        print(*table(file.results), f"written: {file.path}", sep="\n")
     return int(any(failures(file.results) for _, file in files))
 
 
@@ -84,37 +83,17 @@ class _Turn(NamedTuple):
     repeat: int
     runs: Path
 
-    def run(self, overrides: Sequence[str]) -> None:
+    def run(self, gpus: Sequence[int]) -> None:
         """Runs it, and writes: an interruption loses the running ones only."""
         name = f"{self.file.suite}-{as_word(self.case.name)}-{self.repeat}"
         folder = unused(self.runs / name)
-        done = run_case(self.case, self.repeat, (*overrides, f"run.dir={folder}"), folder)
+        own = (f"plan.gpus=[{','.join(map(str, gpus))}]",) if gpus else ()
+        done = run_case(self.case, self.repeat, (*own, f"run.dir={folder}"), folder)
         with self.file.changing() as results:
             kept = results["cases"][self.case.name]
             kept["config"] = done.pop("config", kept.get("config"))
             # Runs that go on at the same time are noted as they end: each has its number.
             kept["runs"].append({**done, "repeat": self.repeat})
-
-
-def run_all(turns: Sequence[_Turn], free: FreeGpus | None) -> None:
-    """One after the other, or as soon as GPUs are free for them."""
-
-    def run(turn: _Turn) -> None:
-        with free.taken(turn.case.gpus) if free else nullcontext(()) as gpus:
-            turn.run((f"plan.gpus=[{','.join(map(str, gpus))}]",) if free else ())
-
-    if free is None:  # In this thread, which signals interrupt.
-        for turn in turns:
-            run(turn)
-        return
-    with ThreadPoolExecutor(free.count) as pool:
-        started = [pool.submit(run, turn) for turn in turns]
-        try:
-            for one in started:
-                one.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
 
 
 def unused(folder: Path) -> Path:
@@ -170,38 +149,37 @@ def failures(results: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def table(results: dict[str, Any]) -> str:
+def table(results: Mapping[str, Any]) -> list[str]:
     """Medians over the runs of a call, one row per case, with the ratio to the first case.
 
     The spread is that of the rate of training, of the fastest run less the slowest.
     """
-    rows = [
-        f"{'case':32} {'sim':>10} {'inference':>10} {'train':>10} {'spread':>6} {'ratio':>6} "
-        f"{'return':>8} {'MiB':>7}"
-    ]
-    first: float | None = None
+    rows: list[list[str]] = []
+    first: Figure | None = None
     for name, case in results["cases"].items():
         summaries = [run["summary"] for run in case["runs"] if "summary" in run]
         if not summaries:
-            rows.append(f"{name:32} {case['runs'][-1]['failed'] if case['runs'] else 'not run'}")
+            failure = case["runs"][-1]["failed"] if case["runs"] else "not run"
+            rows.append([name, failure, *[""] * 6])
             continue
-        rates = [_of_all(summaries, rate) for rate in RATES]
-        first = first or rates[-1]
-        shown = " ".join(f"{rate:10,.0f}" for rate in rates)
-        memory = _of_all([summary["device"] for summary in summaries], "peak_memory_mib")
-        trained = [summary["step_per_s_train"] for summary in summaries]
-        spread = (max(trained) - min(trained)) / rates[-1]
-        rows.append(
-            f"{name:32} {shown} {spread:6.1%} {rates[-1] / first:6.2f} "
-            f"{_of_all(summaries, 'final_return'):8,.0f} {memory:7,.0f}"
+        simulated, inferred, trained, final = (
+            figure([one[key] for one in summaries if one.get(key) is not None])
+            for key in (*RATES, "final_return")
         )
-    return "\n".join(rows)
-
-
-def _of_all(summaries: Sequence[Mapping[str, Any]], key: str) -> float:
-    """Median of a figure over runs, NaN where one has none."""
-    values: list[Any] = [summary.get(key) for summary in summaries]
-    return math.nan if None in values else statistics.median(values)
+        first = first or trained
+        memory = figure([one["device"]["peak_memory_mib"] for one in summaries])
+        spread = (trained.high - trained.low) / trained.median if trained else None
+        rates = (found and found.median for found in (simulated, inferred, trained))
+        rows.append(
+            [
+                name,
+                *(shown(found, ",.0f") for found in rates),
+                *(shown(spread, ".1%"), shown(over(trained, first))),
+                *(shown(found and found.median, ",.0f") for found in (final, memory)),
+            ]
+        )
+    head = "case | sim: | inference: | train: | spread: | ratio: | return: | MiB:"
+    return markdown(head, rows)
 
 
 def _options() -> argparse.Namespace:

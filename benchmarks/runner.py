@@ -1,4 +1,4 @@
-"""Runs the commands of benchmarks: in turn, in time, and at the same time where GPUs are free."""
+"""Runs the commands of benchmarks: in turn, in time, several at the same time."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import IO, TypeVar
+from typing import IO, Any, NamedTuple, TypeVar
 
 from benchmarks.records import RESULTS
 from gmijax.errors import ConfigError
+from gmijax.runs.folder import read_json
+from gmijax.supervise.failures import last_line
 
 STOP_S = 15.0
 """For a command that meets its deadline to save and end."""
@@ -130,6 +131,50 @@ def run_command(
     return wait_until(deadline_s, start(command, variables or {}))[0]
 
 
+class Command(NamedTuple):
+    """A command whose output goes to `log` in a folder, with variables of its environment."""
+
+    words: Sequence[str]
+    folder: Path
+    variables: Mapping[str, str]
+
+
+def failures_of(commands: Sequence[Command], deadline_s: float) -> list[str | None]:
+    """Runs commands at the same time; the last line of those that failed, else None."""
+    with ExitStack() as logs:
+        processes = [
+            start(one.words, one.variables, logs.enter_context((one.folder / "log").open("wb")))
+            for one in commands
+        ]
+        codes = wait_until(deadline_s, *processes)
+    return [
+        (last_line(one.folder / "log") or f"exit code {code}") if code else None
+        for one, code in zip(commands, codes, strict=True)
+    ]
+
+
+def sweep_report(
+    words: Sequence[str],
+    folder: Path,
+    deadline_s: float,
+    variables: Mapping[str, str] | None = None,
+) -> tuple[int, dict[str, Any]]:
+    """Runs a sweep in a folder: its exit code, and its `sweep.json`; ends this if it wrote none.
+
+    Args:
+      words: of `gmijax.sweep`.
+      folder: of the sweep.
+      deadline_s: see `wait_until`.
+      variables: of the environment.
+    """
+    more = ("run.measure_throughput=false", *words, f"run.dir={folder}")
+    code = run_command([sys.executable, "-m", "gmijax.sweep", *more], deadline_s, variables)
+    report = folder / "sweep.json"
+    if not report.exists():
+        raise SystemExit(f"no result of a sweep with {' '.join(words)} (exit code {code})")
+    return code, read_json(report)
+
+
 def failure_of(command: Sequence[str], folder: Path | None = None) -> str | None:
     """Runs a command; the last line that it wrote to stderr if it failed, else None.
 
@@ -152,30 +197,3 @@ def failure_of(command: Sequence[str], folder: Path | None = None) -> str | None
 def as_word(text: str) -> str:
     """Letters and digits only: a name of a folder that is a value on a command line."""
     return re.sub(r"[^a-zA-Z0-9]+", "-", text)
-
-
-class FreeGpus:
-    """The GPUs that are free, by index; usable from any thread.
-
-    Attributes:
-      count: how many there are.
-    """
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-        self._free = set(range(count))
-        self._changed = threading.Condition()
-
-    @contextmanager
-    def taken(self, count: int = 1) -> Iterator[tuple[int, ...]]:
-        """Takes `count` of them once so many are free."""
-        with self._changed:
-            self._changed.wait_for(lambda: len(self._free) >= count)
-            mine = sorted(self._free)[:count]
-            self._free.difference_update(mine)
-        try:
-            yield tuple(mine)
-        finally:
-            with self._changed:
-                self._free.update(mine)
-                self._changed.notify_all()

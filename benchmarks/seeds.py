@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 
 import gmijax
 from benchmarks.outcomes import Outcome, against, outcome_of, summary
-from benchmarks.records import ResultsFile, device_name, file_name
-from benchmarks.runner import deadline, exit_code, in_turn, options, run_command
+from benchmarks.records import ResultsFile, results_file
+from benchmarks.runner import deadline, exit_code, in_turn, options, sweep_report
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
@@ -50,62 +50,42 @@ def row_of(text: str) -> Row:
     return Row(name.strip(), tuple(shlex.split(overrides)))
 
 
-class Benchmark:
-    """The rows of one call, in its file after each of them."""
-
-    def __init__(self, given: argparse.Namespace, task: str) -> None:
-        self._given, self._task = given, task
-        self._deadline_s = deadline(given.deadline_s)
-        path = given.out / file_name(f"seeds-{task}", device_name())
-        self.file = ResultsFile(path, "seeds", vars(given))
-        self.rows: list[dict[str, Any]] = []
-        self._baseline: Sequence[Outcome] = ()
-
-    def run(self, rows: Sequence[Row]) -> None:
-        """Every row that there is time for; a row is expected to take as long as one before."""
-        for _, row in in_turn(rows, 1, self._deadline_s, like=lambda _: "any"):
-            with tempfile.TemporaryDirectory() as scratch:
-                self._sweep(row, (self._given.runs or Path(scratch)) / row.folder)
-
-    def _sweep(self, row: Row, folder: Path) -> None:
-        """Trains a row and writes it down, what is through too if it is interrupted."""
-        given, started_s, code = self._given, time.monotonic(), 130
-        command = [
-            *(sys.executable, "-m", "gmijax.sweep", "run.measure_throughput=false"),
-            *(*given.overrides, *row.overrides, f"seed=range({given.seeds})"),
-            *(f"sweep.jobs_per_gpu={given.at_once}", f"sweep.pack={given.pack}"),
-            f"run.dir={folder}",
-        ]
-        try:
-            code = run_command(command, self._deadline_s)
-        finally:
-            if (folder / "sweep.json").exists():
-                seconds = round(time.monotonic() - started_s, 2)
-                self._add(row, folder, {"code": code, "command_s": seconds})
-        if not (folder / "sweep.json").exists():
-            raise SystemExit(f"row {row.name}: no result of its sweep (exit code {code})")
-
-    def _add(self, row: Row, folder: Path, own: Mapping[str, Any]) -> None:
-        report = read_json(folder / "sweep.json")
-        outcomes, unfinished = outcomes_of(self._task, folder, report)
-        found = {
-            "row": row.name,
-            "overrides": row.overrides,
-            **own,
-            "status": report["status"],
-            "trainings_per_hour": report["trainings_per_hour"],
-            "unfinished": unfinished,
-            **summary(outcomes),
-        }
-        if self.rows:
-            found |= against(outcomes, self._baseline)
-        else:
-            self._baseline = outcomes
-        self.rows.append({**found, "each": [one._asdict() for one in outcomes]})
-        with self.file.changing() as results:
-            results.update(task=self._task, rows=self.rows)
-        sys.stdout.write(f"{line(found)}\n")
-        sys.stdout.flush()
+def train(
+    row: Row,
+    folder: Path,
+    given: argparse.Namespace,
+    file: ResultsFile,
+    baseline: Sequence[Outcome] | None,
+    deadline_s: float,
+) -> Sequence[Outcome]:
+    """Trains a row and writes it down, what is through too if it is interrupted."""
+    task = file.results["task"]
+    words = [
+        *(*given.overrides, *row.overrides, f"seed=range({given.seeds})"),
+        *(f"sweep.jobs_per_gpu={given.at_once}", f"sweep.pack={given.pack}"),
+    ]
+    started_s, code, outcomes = time.monotonic(), 130, []
+    try:
+        code, _ = sweep_report(words, folder, deadline_s)
+    finally:
+        if (folder / "sweep.json").exists():
+            report = read_json(folder / "sweep.json")
+            outcomes, unfinished = outcomes_of(task, folder, report)
+            found = {
+                "row": row.name,
+                "overrides": row.overrides,
+                "code": code,
+                "command_s": round(time.monotonic() - started_s, 2),
+                "status": report["status"],
+                "trainings_per_hour": report["trainings_per_hour"],
+                "unfinished": unfinished,
+                **summary(outcomes),
+                **({} if baseline is None else against(outcomes, baseline)),
+                "each": [one._asdict() for one in outcomes],
+            }
+            file.add("rows", found)
+            print(line(found), flush=True)
+    return outcomes
 
 
 def outcomes_of(task: str, folder: Path, report: Mapping[str, Any]) -> tuple[list[Outcome], int]:
@@ -148,10 +128,18 @@ def line(row: Mapping[str, Any]) -> str:
 def main() -> int:
     """Trains what the command line asks for; returns 1 if a job failed, else 0."""
     given = _options()
-    rows = [row_of(text) for text in given.row]
-    benchmark = Benchmark(given, checked(given.overrides, rows))
-    benchmark.run(rows)
-    return int(any(row["status"] == "failed" for row in benchmark.rows))
+    rows = [row_of(text) for text in given.row or ["baseline"]]
+    task, deadline_s = checked(given.overrides, rows), deadline(given.deadline_s)
+    file = results_file(given, "seeds", f"-{task}")
+    file.results["task"] = task
+    baseline: Sequence[Outcome] | None = None
+    # A row is expected to take as long as one before.
+    for _, row in in_turn(rows, 1, deadline_s, like=lambda _: "any"):
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = (given.runs or Path(scratch)) / row.folder
+            outcomes = train(row, folder, given, file, baseline, deadline_s)
+        baseline = outcomes if baseline is None else baseline
+    return int(any(row["status"] == "failed" for row in file.results.get("rows", ())))
 
 
 def checked(overrides: Sequence[str], rows: Sequence[Row]) -> str:
@@ -175,9 +163,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--row",
         action="append",
-        required=True,
         metavar="'NAME: OVERRIDE ...'",
-        help="a setting; the first one is the baseline",
+        help="a setting; the first one is the baseline; none: that of all runs",
     )
     parser.add_argument("--seeds", type=int, default=20, help="runs of a row")
     parser.add_argument("--at-once", default="8", help="runs at once on every GPU, or auto")

@@ -17,7 +17,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.evaluation.other_tables import SERVING_HEAD, serving_row
+from benchmarks.evaluation.writer import markdown
+from benchmarks.records import results_file
 from benchmarks.runner import as_word, exit_code, failure_of, in_turn, options
 from gmijax.runs.folder import RunPaths, read_json
 
@@ -60,16 +62,13 @@ class Setting(NamedTuple):
 def main() -> int:
     """Measures what the command line asks for; returns 1 if a job failed, else 0."""
     given = _options()
-    file = ResultsFile(given.out / file_name("serving", device_name()), "serving", vars(given))
-    cases: list[dict[str, Any]] = []
+    file = results_file(given, "serving")
     for task, backend, m in itertools.product(given.tasks, given.backends, given.simulators):
         # The environments of a task are split over its simulators.
-        cases.append(measure(Setting(task, backend, m, given.envs // m), given))
-        sys.stdout.write(f"{line(cases[-1])}\n")
-        sys.stdout.flush()
-        with file.changing() as results:
-            results["cases"] = cases
-    return int(any("failed" in case for case in cases))
+        case = measure(Setting(task, backend, m, given.envs // m), given)
+        file.add("cases", case)
+        print(*markdown(SERVING_HEAD, [serving_row(case)]), sep="\n", flush=True)
+    return int(any("failed" in case for case in file.results["cases"]))
 
 
 def measure(setting: Setting, given: argparse.Namespace) -> dict[str, Any]:
@@ -99,21 +98,6 @@ def measure(setting: Setting, given: argparse.Namespace) -> dict[str, Any]:
         # COM: pipes, copies between host and device, and waiting for the agent's turn.
         case |= {"simulator_s": simulate, "agent_s": infer, "com_s": exchange - infer}
     return case
-
-
-def line(case: Mapping[str, Any]) -> str:
-    """One case for people."""
-    if "failed" in case:
-        return f"{case['name']:36} failed: {case['failed']}"
-    parts = [f"{case['name']:36}"]
-    found = [key for key in ("colocated", "dedicated") if key in case]
-    parts += [f"{key} {case[key]:12,.0f} env steps/s" for key in found]
-    if "colocated" in case and "dedicated" in case:
-        parts.append(f"ratio {case['colocated'] / case['dedicated']:.2f}")
-    if "com_s" in case:
-        stages = (case[key] * 1e3 for key in ("simulator_s", "agent_s", "com_s"))
-        parts.append("T_s {:.3f} T_a {:.3f} COM {:.3f} ms".format(*stages))
-    return "  ".join(parts)
 
 
 def _options() -> argparse.Namespace:

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.records import ResultsFile, device_name, results_file
 from benchmarks.runner import STOP_S, exit_code, options
 from gmijax.cli.compose import compose
 from gmijax.errors import JobInterrupted, SweepFailed
@@ -85,7 +85,7 @@ RECIPES: Mapping[str, Recipe] = {
 def main() -> int:
     """Trains and evaluates; returns 1 if a training failed."""
     given = _options()
-    file = ResultsFile(given.out / file_name("shipped", device_name()), "shipped", vars(given))
+    file = results_file(given, "shipped")
     code = 0
     if not given.only_evaluate:
         with tempfile.TemporaryDirectory() as scratch:

@@ -11,20 +11,18 @@ the deadline keeps what is through; a sweep that would not end in time is not st
 from __future__ import annotations
 
 import argparse
-import json
-import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.records import ResultsFile, device_name, file_name
-from benchmarks.runner import deadline, exit_code, in_turn, options, run_command
+from benchmarks.evaluation.figures import figure, shown
+from benchmarks.records import results_file
+from benchmarks.runner import deadline, exit_code, in_turn, options, sweep_report
 from benchmarks.steady import curve_of, steady_rate
 from gmijax.machine.snapshot import detect_machine
-from gmijax.runs.folder import read_json
 
 
 class Way(NamedTuple):
@@ -49,84 +47,45 @@ class Way(NamedTuple):
         return f"{self.at_once} at once, {self.how}{', ' * bool(self.tasks)}{self.tasks}"
 
 
-class Benchmark:
-    """The sweeps of one call, in its file after each of them."""
-
-    def __init__(self, given: argparse.Namespace) -> None:
-        self._given = given
-        path = given.out / file_name("sweeps", device_name())
-        self.file = ResultsFile(path, "sweeps", vars(given))
-        self._deadline_s = deadline(given.deadline_s)
-        self.runs: list[dict[str, Any]] = []
-
-    def run(self, ways: Sequence[Way]) -> None:
-        """Every way as often as wanted, all of them once before one comes twice."""
-        with tempfile.TemporaryDirectory() as scratch:
-            cache = Path(scratch) / "xla" if self._given.warm else None
-            if cache is not None:
-                for way in dict.fromkeys(way.compiling for way in ways):
-                    self._sweep(way, cache, ("num_timesteps=1",))
-            for repeat, way in in_turn(ways, self._given.repeats, self._deadline_s):
-                row = {"way": str(way), "repeat": repeat, **self._sweep(way, cache)}
-                self.runs.append(row)
-                sys.stdout.write(f"{json.dumps(row)}\n")
-                sys.stdout.flush()
-                with self.file.changing() as results:
-                    results.update(medians=self.medians(ways), runs=self.runs)
-
-    def medians(self, ways: Sequence[Way]) -> dict[str, dict[str, Any]]:
-        """Of the sweeps that are through, by way."""
-        found: dict[str, dict[str, Any]] = {}
-        for way in map(str, ways):
-            of_way = [run for run in self.runs if run["way"] == way]
-            if done := [run for run in of_way if run["status"] == "completed"]:
-                steady = [rate for run in done if (rate := run["steady_steps_per_s"])]
-                found[way] = {
-                    "sweeps": len(done),
-                    "trainings_per_hour": statistics.median(
-                        run["trainings_per_hour"] for run in done
-                    ),
-                    # Never, where runs are too short to overlap.
-                    "steady_steps_per_s": statistics.median(steady) if steady else None,
-                }
-        return found
-
-    def _sweep(self, way: Way, cache: Path | None, more: Sequence[str] = ()) -> dict[str, Any]:
-        """One sweep as a whole command."""
-        tasks = way.tasks.split(",") if way.tasks else []
-        is_one_each = more and not way.is_one_program
-        seeds = 1 if is_one_each else max(1, self._given.jobs // max(1, len(tasks)))
-        with tempfile.TemporaryDirectory() as scratch:
-            folder = Path(scratch) / "sweep"
-            command = [
-                *(sys.executable, "-m", "gmijax.sweep", "run.measure_throughput=false"),
-                *(*self._given.overrides, *([f"env={way.tasks}"] if tasks else []), *more),
+def run_sweep(
+    way: Way, given: argparse.Namespace, deadline_s: float, cache: Path | None, *more: str
+) -> dict[str, Any]:
+    """One sweep as a whole command."""
+    tasks = way.tasks.split(",") if way.tasks else []
+    is_one_each = more and not way.is_one_program
+    seeds = 1 if is_one_each else max(1, given.jobs // max(1, len(tasks)))
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch) / "sweep"
+        started_s = time.monotonic()
+        code, report = sweep_report(
+            [
+                *(*given.overrides, *([f"env={way.tasks}"] if tasks else []), *more),
                 *(f"seed=range({seeds})", f"sweep.jobs_per_gpu={way.at_once}"),
                 "sweep.pack=vmap" if way.is_one_program else f"plan.backend={way.how}",
-                *("sweep.gpus=1", f"run.dir={folder}"),
-            ]
-            started_s = time.monotonic()
-            variables = {"JAX_COMPILATION_CACHE_DIR": str(cache or Path(scratch) / "xla")}
-            code = run_command(command, self._deadline_s, variables)
-            command_s = round(time.monotonic() - started_s, 2)
-            if not (folder / "sweep.json").exists():
-                raise SystemExit(f"no result of {' '.join(command)}")
-            report = read_json(folder / "sweep.json")
-            curves = [curve for row in report["jobs"] if (curve := curve_of(row))]
-        jobs, each = report["jobs"], report["sweep"]["jobs_per_gpu"]
-        steady = steady_rate(curves, min(each, len(jobs))) if isinstance(each, int) else None
-        return {
-            "status": report["status"],
-            "code": code,
-            "jobs_per_gpu": each,
-            "command_s": command_s,
-            "trainings_per_hour": report["trainings_per_hour"],
-            "steady_steps_per_s": steady,
-            "first_update_s": [job["first_update_s"] for job in jobs],
-            "job_wall_s": [job["wall_s"] for job in jobs],
-            "values": [job["value"] for job in jobs],
-            "states": [job["state"] for job in jobs],
-        }
+                "sweep.gpus=1",
+            ],
+            folder,
+            deadline_s,
+            {"JAX_COMPILATION_CACHE_DIR": str(cache or Path(scratch) / "xla")},
+        )
+        command_s = round(time.monotonic() - started_s, 2)
+        curves = [curve for row in report["jobs"] if (curve := curve_of(row))]
+    jobs, each = report["jobs"], report["sweep"]["jobs_per_gpu"]
+    return {
+        "status": report["status"],
+        "code": code,
+        "jobs_per_gpu": each,
+        "command_s": command_s,
+        "trainings_per_hour": report["trainings_per_hour"],
+        # Never, where runs are too short to overlap.
+        "steady_steps_per_s": steady_rate(curves, min(each, len(jobs)))
+        if isinstance(each, int)
+        else None,
+        "first_update_s": [job["first_update_s"] for job in jobs],
+        "job_wall_s": [job["wall_s"] for job in jobs],
+        "values": [job["value"] for job in jobs],
+        "states": [job["state"] for job in jobs],
+    }
 
 
 def main() -> int:
@@ -139,18 +98,31 @@ def main() -> int:
     }
     ways = [Way(str(n), how, given.mix) for how, found in counts.items() for n in found]
     ways += [Way("auto", "auto", given.mix)] if given.auto else []
-    benchmark = Benchmark(given)
-    try:
-        benchmark.run(ways)
-    finally:
-        for way, row in benchmark.medians(ways).items():
-            steady = row["steady_steps_per_s"]
-            shown = "-" if steady is None else f"{steady:,.0f}"
-            sys.stdout.write(
-                f"{way}: {row['trainings_per_hour']:.1f} runs/h, {shown} steps/s while all "
-                f"places train ({row['sweeps']} sweeps)\n"
-            )
-    return int(any(run["status"] == "failed" for run in benchmark.runs))
+    file, deadline_s = results_file(given, "sweeps"), deadline(given.deadline_s)
+    with tempfile.TemporaryDirectory() as scratch:
+        cache = Path(scratch) / "xla" if given.warm else None
+        if cache is not None:
+            for way in dict.fromkeys(way.compiling for way in ways):
+                run_sweep(way, given, deadline_s, cache, "num_timesteps=1")
+        try:
+            for repeat, way in in_turn(ways, given.repeats, deadline_s):
+                measured = run_sweep(way, given, deadline_s, cache)
+                file.add("runs", {"way": str(way), "repeat": repeat, **measured})
+        finally:
+            runs = file.results.get("runs", [])
+            for text in medians(runs):
+                print(text)
+    return int(any(run["status"] == "failed" for run in runs))
+
+
+def medians(runs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """What the sweeps that are through made, a line for each way."""
+    for way in dict.fromkeys(run["way"] for run in runs):
+        done = [run for run in runs if run["way"] == way and run["status"] == "completed"]
+        per_hour = shown(figure([run["trainings_per_hour"] for run in done]), ".1f")
+        steady = figure([rate for run in done if (rate := run["steady_steps_per_s"])])
+        steps = shown(steady, ",.0f")
+        yield f"{way}: {per_hour} runs/h, {steps} steps/s while all places train"
 
 
 def _options() -> argparse.Namespace:

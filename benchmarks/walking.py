@@ -9,6 +9,9 @@ the first step until the policy is there. Programs are compiled before, in a sho
     python -m benchmarks.walking env=go1 num_timesteps=60e6 --seeds 5
     python -m benchmarks.walking env=g1 --script='--impl=warp --num_timesteps=200000000'
 
+With `--gpus` seeds are trained and tested at the same time, each on a GPU of its own with its part
+of the cores.
+
 `--script` trains with Playground's own script (Brax's PPO) too, in turn with ours, with its own
 settings but for these flags. Its short training has as many steps as it makes between two
 evaluations: their number is part of its program. Adds a call to
@@ -31,12 +34,14 @@ from pathlib import Path
 from typing import Any
 
 import gmijax
+from benchmarks.free_gpus import Part, on_free_gpus, part_of
 from benchmarks.peers.side import variables_of_brax
-from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.records import results_file
 from benchmarks.runner import deadline, exit_code, in_turn, options, run_command
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
+from gmijax.machine.snapshot import detect_machine
 from gmijax.player.joystick import robot_of
 from gmijax.player.walking import LEAST_ENVS, NUM_ENVS
 from gmijax.runs.folder import RunPaths, read_json, write_json
@@ -56,30 +61,50 @@ class Benchmark:
         self._given, self._config, self._scratch = given, config, scratch
         self._deadline_s = deadline(given.deadline_s)
         self._trained_by_s = self._deadline_s - given.reserve_s
-        path = given.out / file_name(f"walking-{config.env.slug}", device_name())
-        self.file = ResultsFile(path, "walking", vars(given))
+        self._machine = detect_machine()
+        # A training has one GPU, however many work at the same time.
+        of_one = f"1 x {self._machine.gpus[0].name}" if self._machine.gpus else None
+        self.file = results_file(given, "walking", f"-{config.env.slug}", device=of_one)
         self.runs: list[dict[str, Any]] = []
-        self._code_of_tests = 0
+        self._codes_of_tests: list[int] = []
 
     @property
     def has_failed(self) -> bool:
         """Whether a training of ours or the tests failed; the script may fail at its film."""
         ours = [run["code"] for run in self.runs if run["trainer"] == OURS]
-        return any(ours) or self._code_of_tests != 0
+        return any(ours) or any(self._codes_of_tests)
 
     def run(self) -> None:
         """Trains with all seeds, tests, and writes both down."""
         trainers = [OURS] if self._given.script is None else [OURS, SCRIPT]
+        count = min(self._given.gpus, len(self._machine.gpus), self._given.seeds)
         if not self._given.cold:
             for trainer in trainers:
-                self._train(trainer, "compile", is_short=True)
-        for seed, trainer in in_turn(trainers, self._given.seeds, self._trained_by_s):
-            self.runs.append({"trainer": trainer, "seed": seed, **self._train(trainer, str(seed))})
-            self._write()
-        self._test()
+                self._train(trainer, "compile", Part(), is_short=True)
+
+        def seeds_of(number: int, gpus: Sequence[int]) -> None:
+            part = part_of(self._machine, gpus[0], count) if gpus else Part()
+            seeds = range(number, self._given.seeds, max(1, count))
+            self._seeds(str(number), trainers, seeds, part)
+
+        numbers = range(max(1, count))
+        on_free_gpus(count if count > 1 else None, numbers, lambda _: 1, seeds_of)
         self._write()
 
-    def _train(self, trainer: str, name: str, *, is_short: bool = False) -> dict[str, Any]:
+    def _seeds(self, name: str, trainers: Sequence[str], seeds: Sequence[int], part: Part) -> None:
+        """Trains with these seeds, then tests what came of them."""
+        mine: list[dict[str, Any]] = []
+        for number, trainer in in_turn(trainers, len(seeds), self._trained_by_s):
+            seed = seeds[number]
+            run = {"trainer": trainer, "seed": seed, **self._train(trainer, str(seed), part)}
+            mine.append(run)
+            self.runs.append(run)
+            self._write()
+        self._test(name, mine, part)
+
+    def _train(
+        self, trainer: str, name: str, part: Part, *, is_short: bool = False
+    ) -> dict[str, Any]:
         """One training as a whole command, and its checkpoints."""
         folder = self._scratch / f"{trainer}-{name}"
         try:
@@ -87,14 +112,14 @@ class Benchmark:
         except FileExistsError:
             raise ConfigError(f"--runs={self._given.runs}: has a {folder.name} already") from None
         cache = folder if self._given.cold else self._scratch
-        variables = {"JAX_COMPILATION_CACHE_DIR": str(cache / "xla")}
+        variables = {**part.variables, "JAX_COMPILATION_CACHE_DIR": str(cache / "xla")}
         if trainer == OURS:
             command = self._our_command(folder, name, is_short=is_short)
         else:
             command = self._script_command(folder, name, is_short=is_short)
             variables |= variables_of_brax("playground")
         started_s = time.time()
-        code = run_command(command, self._trained_by_s, variables)
+        code = run_command([*part.prefix, *command], self._trained_by_s, variables)
         command_s = time.time() - started_s
         checkpoints = _ours(folder, started_s) if trainer == OURS else _theirs(folder, started_s)
         for one in checkpoints:  # Environments take hundreds of MB; only policies are tested.
@@ -132,23 +157,25 @@ class Benchmark:
         parts = max(1, flags.num_evals - 1)
         return f"--num_timesteps={math.ceil(steps / parts)}", "--num_evals=2"
 
-    def _test(self) -> None:
-        """All checkpoints, in a process of their own."""
-        given, out = self._given, self._scratch / "walks.json"
-        asked = {
+    def _test(self, name: str, mine: Sequence[dict[str, Any]], part: Part) -> None:
+        """All checkpoints of these trainings, in a process of their own."""
+        given = self._given
+        asked, out = (self._scratch / f"{kind}-{name}.json" for kind in ("tests", "walks"))
+        config = {
             "env": to_dict(self._config.env),
             "num_envs": given.envs,
             "seed": given.test_seed,
-            "runs": [[one["folder"] for one in run["checkpoints"]] for run in self.runs],
-            "impls": [self._impl(run["trainer"]) for run in self.runs],
+            "runs": [[one["folder"] for one in run["checkpoints"]] for run in mine],
+            "impls": [self._impl(run["trainer"]) for run in mine],
         }
-        write_json(self._scratch / "tests.json", asked)
+        write_json(asked, config)
         module = [sys.executable, "-m", "benchmarks.walking_tests"]
-        command = [*module, str(self._scratch / "tests.json"), str(out)]
+        command = [*part.prefix, *module, str(asked), str(out)]
         cache = {"JAX_COMPILATION_CACHE_DIR": str(self._scratch / "xla")}
-        self._code_of_tests = run_command(command, self._deadline_s, cache)
-        found = read_json(out)["walks"] if out.exists() else [[] for _ in self.runs]
-        for run, walks in zip(self.runs, found, strict=True):
+        code = run_command(command, self._deadline_s, {**part.variables, **cache})
+        self._codes_of_tests.append(code)
+        found = read_json(out)["walks"] if out.exists() else [[] for _ in mine]
+        for run, walks in zip(mine, found, strict=True):
             for checkpoint, walk in zip(run["checkpoints"], walks, strict=False):
                 checkpoint["walk"] = walk
             run["walks_from"] = walks_from(run["checkpoints"])
@@ -163,7 +190,7 @@ class Benchmark:
         rows = summary(self.runs)
         runs = [
             {**run, "checkpoints": [_without_folder(one) for one in run["checkpoints"]]}
-            for run in self.runs
+            for run in sorted(self.runs, key=lambda run: run["seed"])
         ]
         with self.file.changing() as results:
             results.update(task=self._config.env.label, rows=rows, runs=runs)
@@ -262,6 +289,7 @@ def _options() -> argparse.Namespace:
     parser = options("walking", __doc__)
     parser.add_argument("overrides", nargs="*", help="of our trainings, e.g. env=go1")
     parser.add_argument("--seeds", type=int, default=5, help="trainings of each kind")
+    parser.add_argument("--gpus", type=int, default=1, help="for seeds at the same time")
     parser.add_argument("--tests", type=int, default=20, help="checkpoints of a training")
     parser.add_argument("--envs", type=int, default=NUM_ENVS, help="environments of a test")
     parser.add_argument("--test-seed", type=int, default=0, help="of the test's starts")

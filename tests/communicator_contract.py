@@ -99,3 +99,67 @@ def check_contract(
             assert result["error"] == "CollectiveTimeout", result
             assert result["missing"] == [case.victim], result
         assert ", step" in result["message"]
+
+
+class RingsOverNodes(NamedTuple):
+    """Two nodes that exchange by NCCL, and how a rank of the second one ends."""
+
+    strategy: str
+    intra: str
+    layout: tuple[tuple[int, ...], ...]
+    victim: int
+    signal: signal.Signals
+
+    def __str__(self) -> str:
+        return f"{self.strategy}-{Layout(self.layout)}-{self.victim}"
+
+
+RINGS_OVER_NODES = [
+    RingsOverNodes("flat", "host", ((0,), (1,)), 1, signal.SIGKILL),
+    RingsOverNodes("one_shot", "ipc", ((0, 1), (2, 3)), 2, signal.SIGSTOP),
+    RingsOverNodes("one_shot", "ipc", ((0, 1), (2, 3)), 3, signal.SIGKILL),
+    RingsOverNodes("har", "ipc", ((0, 1), (2, 3)), 2, signal.SIGKILL),
+]
+
+
+def check_rings_over_nodes(case: RingsOverNodes, folder: Path, gpus: Sequence[int] = ()) -> None:
+    """Means are right and the same on all; the end of a rank is seen on both nodes.
+
+    Args:
+      case: what is checked.
+      folder: for the files of the ranks.
+      gpus: devices by position of a GPU in the layout; none: the CPU, with stand-ins.
+    """
+    ranks, leader = Layout(case.layout).num_gmis, case.layout[1][0]
+    is_kill = case.signal == signal.SIGKILL
+    options = {
+        "strategy": case.strategy,
+        "intra": case.intra,
+        "inter": "nccl",
+        "gpus": list(gpus),
+        "layout": case.layout,
+        "num_nodes": 2,
+        "num_floats": 4099,
+        "num_calls": 4,
+        "num_ordered_calls": 60,
+        "timeout_s": 60.0 if is_kill else STOP_NOTICED_S,
+        "goes_on": True,
+    }
+    with Ranks(folder, ranks, "check_all", **options).start() as job:
+        job.wait_for("running")
+        checked = [json.loads((folder / f"checked_{rank}").read_text()) for rank in range(ranks)]
+        job.signal(case.victim, case.signal)
+        left = [rank for rank in range(ranks) if rank != case.victim]
+        results = dict(zip(left, job.results(*left), strict=True))
+    for key in ("digest", "steps_digest"):
+        assert len({result[key] for result in checked}) == 1
+    # Nobody went another way.
+    assert not any("TCP" in (folder / f"stderr_{rank}").read_text() for rank in left)
+    # The leader of the first node watches that of the second, which is in one node with the rank.
+    named = {0: leader} | {rank: case.victim for rank in case.layout[1] if rank in results}
+    for rank, other in named.items():
+        found = results[rank]
+        assert found["error"] in ("PeerLost", "CollectiveTimeout"), found
+        assert (found.get("peer") or found["missing"][0]) == other, found
+    first = results[max(named)]
+    assert first["error"] == ("PeerLost" if is_kill else "CollectiveTimeout"), first

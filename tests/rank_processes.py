@@ -80,6 +80,7 @@ class Ranks:
         layout = [list(range(world_size))]
         # Devices by position of a GPU in the layout; none: the CPU.
         defaults |= {"intra": "host", "layout": layout, "num_nodes": 1, "gpus": []}
+        defaults["inter"] = None
         self._options = {**defaults, "body": body, **options}
         self._fds = self._shared_by_nodes(self._options["num_nodes"])
 
@@ -244,22 +245,35 @@ def layout_of(options: Options) -> Layout:
     return Layout(tuple(tuple(gmis) for gmis in options["layout"]), options["num_nodes"])
 
 
-def use_fake_device_memory(kind: str) -> None:
-    """Lets `intra=ipc` run on the CPU: the real exchange over memory that is not a GPU's."""
+def use_fake_device(kind: str, *, has_rings: bool) -> None:
+    """Lets `intra=ipc` and rings run on the CPU: the real exchange over what is not a GPU's.
+
+    Args:
+      kind: a key of `FAKES`, or `without_network`, whose NCCL does not start.
+      has_rings: whether rings are those of (a stand-in for) NCCL.
+    """
     import fake_device_memory
+    import fake_nccl
 
     from gmijax.collectives import communicator
+    from gmijax.collectives.device.nccl_ring import nccl_ring
 
-    communicator.DEVICE = lambda: fake_device_memory.FAKES[kind]
+    has_network = kind != "without_network"
+    device = fake_device_memory.FAKES[kind if has_network else "fake"]
+    if has_rings:
+        fake_nccl.install(has_network=has_network)
+        device = device._replace(new_ring=nccl_ring)
+    communicator.DEVICE = lambda: device
 
 
 def communicator_of(options: Options) -> Communicator:
     """The communicator of one rank."""
     strategy, rank, layout = options["strategy"], options["rank"], layout_of(options)
     nodes, listener = inherited_nodes()
-    if options["intra"] == "ipc" and not options["gpus"]:
+    has_rings = options["inter"] == "nccl"
+    if (options["intra"] == "ipc" or has_rings) and not options["gpus"]:
         is_special = rank == options.get("special_rank")
-        use_fake_device_memory(options["special"] if is_special else "fake")
+        use_fake_device(options["special"] if is_special else "fake", has_rings=has_rings)
     return make_communicator(
         strategy,
         CommunicatorConfig(
@@ -270,6 +284,7 @@ def communicator_of(options: Options) -> Communicator:
             timeout_s=options["timeout_s"],
             rendezvous_timeout_s=options["start_s"],
             intra=options["intra"],
+            inter=options["inter"],
             host_if_unavailable=options.get("host_if_unavailable", False),
             nodes=nodes,
             listener=listener,

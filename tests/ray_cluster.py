@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -45,12 +45,12 @@ class Cluster:
 
 
 @contextmanager
-def two_nodes(log: Path) -> Iterator[Cluster]:
-    """The nodes while it is entered; `log` gets their errors."""
+def two_nodes(log: Path, gpus: Sequence[int] = ()) -> Iterator[Cluster]:
+    """The nodes while it is entered, with one of these two GPUs each; `log` gets their errors."""
     with (
         log.open("wb") as stderr,
         subprocess.Popen(
-            [sys.executable, str(TWO_NODES)],
+            [sys.executable, str(TWO_NODES), *map(str, gpus)],
             env=child_environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

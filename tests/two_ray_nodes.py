@@ -1,6 +1,7 @@
 """Two nodes of Ray on this machine, for tests: says where they are, ends with its standard input.
 
-A line there adds another node, for one that was killed.
+A line there adds another node, for one that was killed. Arguments are indices of GPUs, one for
+each of the two; without any they have what Ray finds.
 
 A process of its own, because Ray in the process of the tests would start threads and warn there.
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from typing import Any
 
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 
@@ -26,10 +28,11 @@ QUICK = {
 
 def main() -> None:
     """Starts them and waits."""
-    cluster = Cluster(initialize_head=True, head_node_args={**NODE, "_system_config": QUICK})
+    first, other = ({**NODE, **_gpu(gpu)} for gpu in sys.argv[1:] or (None, None))
+    cluster = Cluster(initialize_head=True, head_node_args={**first, "_system_config": QUICK})
     try:
         while True:
-            second = cluster.add_node(**NODE)
+            second = cluster.add_node(**other)
             raylet = second.all_processes["raylet"][0].process.pid
             said = {"address": cluster.address, "second_raylet": raylet}
             sys.stdout.write(f"\n{json.dumps(said)}\n")
@@ -42,6 +45,12 @@ def main() -> None:
             if node is not None:
                 is_there = node.all_processes["raylet"][0].process.poll() is None
                 cluster.remove_node(node, allow_graceful=is_there)
+
+
+def _gpu(index: str | None) -> dict[str, Any]:
+    if index is None:
+        return {}
+    return {"num_gpus": 1, "env_vars": {"CUDA_VISIBLE_DEVICES": index}}
 
 
 if __name__ == "__main__":

@@ -1,54 +1,47 @@
-"""The tables of asynchronous training."""
+"""The tables of training in which some GMIs act and others learn."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from benchmarks.cases import SUITES, Case
-from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, rate, ratio, shown
+from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, figure, rate, ratio, shown
 from benchmarks.evaluation.paper import CHANNELS
-from benchmarks.evaluation.writer import Rows, table
+from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
+from benchmarks.records import Call
 
 LONG = "async-long"
 KEYS = ("pps", "ttop", WHOLE_RUN)
+RATES, GAINS = ("rounds", "updates"), ("held", "rounds_free", "updates_free")
 
-ASYNC = (
-    ("async-1gpu", "sync, 1 GMI x 8192", "sync, 1 GMI x 8192", ""),
-    ("async-1gpu", "1 agent x 8192 + 1 trainer", "sync, 1 GMI x 8192", ""),
-    ("async-1gpu", "2 agents x 4096 + 1 trainer", "sync, 1 GMI x 8192", ""),
-    ("async-1gpu", "4 agents x 2048 + 1 trainer", "sync, 1 GMI x 8192", ""),
-    *(
-        ("async-2gpu", name, "1 + 1 GPUs, one process each", "1.88 PPS, 1.65 TTOP")
-        for name in ("1 + 1 GPUs, one process each", "1 + 1 GPUs, 4 agents + 2 trainers")
-    ),
-    *(
-        ("async-4gpu", name, "3 + 1 GPUs, one process each", "1.88 PPS, 1.65 TTOP")
-        for name in (
-            *("3 + 1 GPUs, one process each", "3 + 1 GPUs, 4 agents + 2 trainers"),
-            "3 + 1 GPUs, 4 agents + 2 trainers, har, batches of 4 agents",
-        )
-    ),
-)
-"""File, case, what it is compared with, the paper's mean over two and four GPUs."""
+ASYNC = ("async-1gpu", "async-2gpu", "async-4gpu")
+"""Suites; what each begins with is what its others are compared with."""
 
 
 @table(
     "async",
     "ant | PPS: | TTOP: | steps/s of the whole run: | ratios: | the paper's: | return at the end:",
-    *("async-1gpu", "async-2gpu", "async-4gpu"),
+    *ASYNC,
 )
 def asynchronous() -> Rows:
     """Agents and trainers: medians of report lines, and whole runs."""
-    for file, case, base, paper in ASYNC:
-        name = case if case.startswith(("1 +", "3 +")) else f"1 GPU, {case}"
+    cases = [(suite, one.name) for suite in ASYNC for one in SUITES[suite]]
+    for file, case in cases:
+        if "each 3 agents" in case:  # GPUs that do both.
+            continue
+        base = SUITES[file][0].name
         cells = [shown(rate(file, case, key), ",.0f") for key in KEYS]
         gains = [shown(ratio(file, case, base, key)) for key in KEYS]
+        name, paper = case, "1.88 PPS, 1.65 TTOP"  # Its mean over two and four GPUs.
         if case == base:
-            gains, paper = ["1"] * 3, "1" if paper else ""
+            gains, paper = ["1"] * 3, "1"
         if file == "async-1gpu":  # One process that does both has no PPS of its own.
-            gains = ["", shown(ratio(file, case, base)), gains[2]]
-            cells[1] = shown(rate(file, case), ",.0f")
-            cells[0] = "" if case == base else cells[0]
+            name, paper = f"1 GPU, {case}", ""
+            gains = [shown(ratio(file, case, base)), gains[2]]
+            cells[:2] = "" if case == base else cells[0], shown(rate(file, case), ",.0f")
         final = shown(rate(file, case, "final_return"), ",.0f")
-        yield [name, *cells, " / ".join(filter(None, gains)), paper, final]
+        yield [name, *cells, " / ".join(gains), paper, final]
 
 
 @table(
@@ -91,3 +84,45 @@ def channels() -> Rows:
         pairs = CHANNELS.get((task, gpus), ())
         paper = " / ".join(f"{multi / uni:.2f}" for uni, multi in pairs)
         yield [f"`{task}`", str(gpus), *map(shown, found), paper]
+
+
+def _task_and_size(call: Call) -> tuple[str, str | None, tuple[int, ...]]:
+    assert call.settings is not None
+    overrides = call.settings["overrides"]
+    task = next(one.removeprefix("env=") for one in overrides if one.startswith("env="))
+    resolved = call.results["resolved"]
+    keys = ("num_envs", "updates_per_step", "batch_size")
+    return task, call.device, tuple(resolved[key] for key in keys)
+
+
+@table_of_calls(
+    "off-policy",
+    "task | environments, updates, batch | one program: rounds/s: | updates/s: | "
+    "two GMIs, ratio held: | as fast as each can: rounds: | updates: | "
+    "over one program at their ratio, computed:",
+    lambda: newest("off-policy-*-nvidia-*.json", _task_and_size),
+    is_brief=True,
+)
+def off_policy(calls: Calls) -> Rows:
+    """What two GMIs of one GPU gain over one program, where one acts and the other learns."""
+    for (task, _, size), (call, _) in sorted(calls.items()):
+        repeats = [one for one in call.results["repeats"] if one["backend"] == "mps"]
+        found = [
+            *((".0f", [one["in_turn"][f"{what}_per_s"] for one in repeats]) for what in RATES),
+            *((".2f", [one["gain"][key] for one in repeats]) for key in GAINS),
+            (".2f", [over_the_same_ratio(one) for one in repeats]),
+        ]
+        cells = (shown(figure(values), form) for form, values in found)
+        yield [f"`{task}`", ", ".join(f"{number:,}" for number in size), *cells]
+
+
+def over_the_same_ratio(repeat: Mapping[str, Any]) -> float:
+    """Two GMIs that wait for nobody, over one program with their ratio of updates to rounds.
+
+    That program is not run: it would take the seconds of a round and those of its updates, each as
+    measured alone in one program.
+    """
+    two, one = repeat["two_gmis"], repeat["in_turn"]
+    updates = two["free_updates_per_s"] / two["free_rounds_per_s"]
+    round_s = 1 / one["acting_alone_rounds_per_s"]
+    return two["free_rounds_per_s"] * (round_s + updates / one["learning_alone_updates_per_s"])

@@ -11,7 +11,8 @@ from benchmarks.records import RESULTS, Call, read_calls
 from gmijax.errors import ConfigError
 
 NOT_MEASURED = "not measured"
-TRAINING = "step_per_s_train"
+RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
+TRAINING = RATES[-1]
 WHOLE_RUN = "env_steps_per_s"
 
 
@@ -64,9 +65,8 @@ def results_of(file: str) -> Mapping[str, Any]:
 
 
 def rate(file: str, case: str, key: str = TRAINING) -> Figure | None:
-    """A figure of the summaries of a case of `<file>.json`."""
-    found = summaries(file, case)
-    return figure([one[key] for one in found if one.get(key) is not None])
+    """A figure of the summaries of a case of `<file>.json`; `key` is a path in them."""
+    return figure([*_at(results_of(file), f"{case}/{key}")])
 
 
 def summaries(file: str, case: str) -> list[Mapping[str, Any]]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from benchmarks.cases import TASKS
 from benchmarks.evaluation.figures import (
+    RATES,
     Figure,
     bounds,
     figure,
@@ -14,10 +16,10 @@ from benchmarks.evaluation.figures import (
     results_of,
     shown,
 )
-from benchmarks.evaluation.writer import Rows, table
-from benchmarks.records import RESULTS
+from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
+from benchmarks.records import RESULTS, Call
+from benchmarks.walking import SCRIPT
 
-RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
 MARKS = (
     ("ant", 3000, "20 s", "async-long", "1 GPU, synchronous"),
     ("humanoid", 5000, "under 240 s", "learn-humanoid", "humanoid"),
@@ -99,3 +101,55 @@ def throughput() -> Rows:
                 name = f"{task} {impl} {envs}"
                 cells = [shown(rate(f"tasks-{impl}", name, key), ",.0f") for key in RATES]
                 yield [f"`{task}`", f"{envs:,}", impl, *cells]
+
+
+def _kind_of_walking(call: Call) -> tuple[str, str, str | None, bool]:
+    """Task, algorithm of our trainings as it is written, GPU and start."""
+    assert call.settings is not None
+    given = dict(word.split("=", 1) for word in call.settings["overrides"])
+    algo = given.get("algo", "ppo").upper()
+    return call.results["task"], algo, call.device, call.settings["cold"]
+
+
+@table_of_calls(
+    "walking",
+    "task | trained by | programs | seeds that walk: | million steps: | seconds of training: | "
+    "seconds of the command: | at the end: million steps: | do not fall: | error, m/s: | rad/s:",
+    lambda: newest("walking-*-nvidia-*.json", _kind_of_walking),
+)
+def walking(calls: Calls) -> Rows:
+    """How long robots are trained until they walk: median, least and most of seeds."""
+    for (task, algo, _, is_cold), (call, _) in sorted(calls.items()):
+        start = "compiled anew" if is_cold else "from the cache"
+        for trainer, row in call.results["rows"].items():
+            name = trainer if trainer == SCRIPT else f"{trainer} {algo}"
+            seeds = f"{row['walk']} of {row['seeds']}"
+            spreads = (
+                _spread(row["env_steps"], 1e-6),
+                *(_spread(row[key]) for key in ("training_s", "command_s")),
+            )
+            yield [f"`{task}`", name, start, seeds, *spreads, *_last_tests(call, trainer)]
+
+
+def _last_tests(call: Call, trainer: str) -> Iterator[str]:
+    """The last test of every training: medians over seeds."""
+    runs = [run["checkpoints"] for run in call.results["runs"] if run["trainer"] == trainer]
+    tested = [[one for one in checkpoints if "walk" in one] for checkpoints in runs]
+    last = [checkpoints[-1] for checkpoints in tested if checkpoints]
+    settled = [one["walk"]["settled"] for one in last]
+    for form, values in (
+        (".0f", [one["env_steps"] / 1e6 for one in last]),
+        (".1%", [one["walk"]["upright"] for one in last]),
+        (".2f", [errors["linear_m_per_s"] for errors in settled]),
+        (".2f", [errors["yaw_rad_per_s"] for errors in settled]),
+    ):
+        # None: all have left the field, or fallen at once.
+        known = [value for value in values if value is not None]
+        yield format(statistics.median(known), form) if known else ""
+
+
+def _spread(values: Sequence[float] | None, scale: float = 1.0) -> str:
+    if values is None:
+        return ""
+    least, median, most = (f"{value * scale:.0f}" for value in values)
+    return f"{median} ({least} to {most})"

@@ -73,21 +73,30 @@ def backends() -> Rows:
             yield [f"`{task}`", size, *rates, shown(mps_over_share(task, gmis)), NOT_MEASURED]
 
 
-@table(
-    "serving-templates",
+SERVING_HEAD = (
     "GMIs that simulate | `tcg`, steps/s: | `tdg`, steps/s: | T_s, ms: | T_a, ms: | COM, ms: "
-    "| model: | measured:",
-    SERVING,
+    "| model: | measured:"
 )
+
+
+@table("serving-templates", SERVING_HEAD, SERVING)
 def serving_templates() -> Rows:
     """Simulator and agent in one GMI against apart, with the paper's model."""
     calls = reversed(read_calls(RESULTS / f"{SERVING}.json"))
     timed = ([case for case in call.results["cases"] if "simulator_s" in case] for call in calls)
-    for case in next(cases for cases in timed if cases):
-        gain = case["colocated"] / case["dedicated"]
-        rates = (f"{case[key]:,.0f}" for key in ("colocated", "dedicated"))
-        times = (f"{1e3 * case[key]:.2f}" for key in ("simulator_s", "agent_s", "com_s"))
-        yield [case["name"], *rates, *times, f"{predicted_gain(case):.2f}", f"{gain:.2f}"]
+    return [serving_row(case) for case in next(cases for cases in timed if cases)]
+
+
+def serving_row(case: Mapping[str, Any]) -> list[str]:
+    """A case of serving, of which one template may not have been measured."""
+    tcg, tdg = case.get("colocated"), case.get("dedicated")
+    times_s = [case.get(key) for key in ("simulator_s", "agent_s", "com_s")]
+    return [
+        *(case["name"], shown(tcg, ",.0f"), shown(tdg, ",.0f")),
+        *(shown(None if one is None else 1e3 * one) for one in times_s),
+        shown(predicted_gain(case) if "com_s" in case else None),
+        shown(tcg / tdg if tcg and tdg else None),
+    ]
 
 
 def predicted_gain(case: Mapping[str, Any]) -> float:
@@ -122,20 +131,25 @@ def _is_answer(point: dict[str, Any], best: dict[str, Any]) -> bool:
     return all(point[key] == best[key] for key in ("gmis_per_gpu", "num_envs", "impl"))
 
 
-@table(
-    "reduction",
-    "GPUs x GMIs | exchange | alone, ms: | 10 to 90 %: | in a chain, ms: | over the model:",
-    REDUCTION,
+REDUCTION_HEAD = (
+    "GPUs x GMIs | exchange | alone, ms: | 10 to 90 %: | in a chain, ms: | over the model:"
 )
+
+
+@table("reduction", REDUCTION_HEAD, REDUCTION)
 def reduction() -> Rows:
     """A mean of 1.5 million numbers, alone and in a chain."""
-    for row in results_of(REDUCTION).get("rows", ()):
-        if row["num_floats"] == 1_500_000:
-            keys = ("median_s", "p10_s", "p90_s", "chained_s")
-            alone, low, high, chained = (f"{1e3 * row[key]:.3f}" for key in keys)
-            fit = row["median_s"] / row["predicted_s"] if row["predicted_s"] else None
-            name = [read_layout(row["layout"]), f"`{row['name']}`"]
-            yield [*name, alone, f"{low} to {high}", chained, shown(fit)]
+    rows = results_of(REDUCTION).get("rows", ())
+    return [reduction_row(row) for row in rows if row["num_floats"] == 1_500_000]
+
+
+def reduction_row(row: Mapping[str, Any]) -> list[str]:
+    """A mean by one way of exchange."""
+    keys = ("median_s", "p10_s", "p90_s", "chained_s")
+    alone, low, high, chained = (f"{1e3 * row[key]:.3f}" for key in keys)
+    fit = row["median_s"] / row["predicted_s"] if row["predicted_s"] else None
+    name = [read_layout(row["layout"]), f"`{row['name']}`"]
+    return [*name, alone, f"{low} to {high}", chained, shown(fit)]
 
 
 def read_layout(text: str) -> str:

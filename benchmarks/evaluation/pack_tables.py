@@ -2,35 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Mapping
+from typing import Any, Final
 
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
-from benchmarks.evaluation.writer import lines, link, markdown, origin
-from benchmarks.records import RESULTS, Call, calls_by_date
+from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
+from benchmarks.records import Call, calls_by_date
 from benchmarks.steady import are_alike
 
-_HEAD = (
-    "training | at once | steps/s while all report: | over one: | trainings per hour: | over one:"
-)
 _STEPS, _FINISHED = "steps_per_s", "trainings_per_hour"
-_IN_README: Final = (
-    ("mjlab Go1, 4096 environments, 30 iterations", "mjlab Go1"),
-    ("CleanRL PPO, gmijax ant, 2048 environments", "CleanRL's PPO"),
-)
+MJLAB: Final = "mjlab Go1, 4096 environments, 30 iterations"
+CLEANRL: Final = "CleanRL PPO, gmijax ant, 2048 environments"
 
 
-class _Training(NamedTuple):
-    """The packs of one training in one call, by number at once."""
+class _Training:
+    """The packs of one training in one call, by number at once.
 
-    call: Call
-    file: str
-    ways: Mapping[str, Sequence[Mapping[str, Any]]]
+    Attributes:
+      ways: the rows of each way, in the order of the file.
+    """
 
-    @property
-    def is_mix(self) -> bool:
-        """Whether its jobs are of several kinds, whose steps do not add up."""
-        return not all(are_alike(row["jobs"]) for rows in self.ways.values() for row in rows)
+    def __init__(self, call: Call, name: str) -> None:
+        self.ways: dict[str, list[Mapping[str, Any]]] = {}
+        for row in _succeeded(call):
+            if row["name"] == name:
+                self.ways.setdefault(row["way"], []).append(row)
 
     def rate(self, way: str, key: str) -> Figure | None:
         """A rate over the repeats of a way."""
@@ -41,80 +37,53 @@ class _Training(NamedTuple):
         alone = next((one for one in self.ways if one.startswith("1 ")), "")
         return over(self.rate(way, key), self.rate(alone, key))
 
-
-@lines("packs")
-def packs() -> list[str]:
-    """Steps per second and trainings per hour of every training, by number at once.
-
-    The newest call of each training counts; a ratio is of one call.
-    """
-    found = _trainings()
-    rows = [cells for name, training in found.items() for cells in _rows(name, training)]
-    calls = {(one.file, one.call.date): one.call for one in found.values()}
-    files = [f"- {link(file)}: {origin(call)}" for (file, _), call in calls.items()]
-    return [*markdown(_HEAD, rows), "", *(files or [f"- `packs-*.json`: {NOT_MEASURED}"])]
+    def last_metric(self, way: str) -> Figure | None:
+        """The last one that jobs of a way printed, over all of them."""
+        curves = [curve for row in self.ways[way] for curve in row.get("curves") or ()]
+        return figure([curve[-1][1] for curve in curves if curve])
 
 
-class Packed(NamedTuple):
-    """Eight trainings of another library at once, over one alone.
-
-    Attributes:
-      name: of the training.
-      steps_per_s: ratio of steps per second.
-      trainings_per_hour: ratio of finished trainings per hour, start-up included.
-      repeats: of both.
-    """
-
-    name: str
-    steps_per_s: float
-    trainings_per_hour: float
-    repeats: int
+def _succeeded(call: Call) -> list[Mapping[str, Any]]:
+    return [row for row in call.results.get("rows", ()) if row.get("exit_code") == 0]
 
 
-def packed() -> list[Packed]:
-    """Of the newest calls; nothing without one."""
-    found, way = _trainings(), "8 at once, mps"
-    gains = []
-    for name, title in _IN_README:
-        training = found.get(name)
-        if training is None:
-            continue
-        steps, finished = (training.over_one(way, key) for key in (_STEPS, _FINISHED))
-        if steps is not None and finished is not None:
-            gains.append(Packed(title, steps, finished, len(training.ways[way])))
-    return gains
+def _of_trainings() -> Calls:
+    """Of every training the newest call."""
+    calls = calls_by_date("packs-nvidia-*.json")
+    return {row["name"]: (call, path) for call, path in calls for row in _succeeded(call)}
 
 
-def packed_gains() -> str:
-    """In words, what eight at once gain."""
-    parts = [
-        f"{one.name} {one.steps_per_s:.2f} and {one.trainings_per_hour:.2f} (n={one.repeats})"
-        for one in packed()
-    ]
-    if not parts:
-        return NOT_MEASURED
-    return f"eight at once over one, in steps/s and in trainings per hour: {', '.join(parts)}"
+@table_of_calls(
+    "packs",
+    "training | at once | steps/s while all report: | over one: | trainings per hour: | "
+    "over one: | reward at the end:",
+    _of_trainings,
+)
+def packs(calls: Calls) -> Rows:
+    """Steps per second and trainings per hour of every training, by number at once."""
+    for name, (call, _) in calls.items():
+        training = _Training(call, name)
+        rows = [row for rows in training.ways.values() for row in rows]
+        has_curves = any(row.get("curves") for row in rows)
+        is_mix = not all(are_alike(row["jobs"]) for row in rows)  # Its steps do not add up.
+        for number, way in enumerate(training.ways):
+            cells = [
+                *(
+                    shown(training.rate(way, _STEPS), ",.0f"),
+                    shown(training.over_one(way, _STEPS)),
+                ),
+                shown(training.rate(way, _FINISHED), ",.1f"),
+                shown(training.over_one(way, _FINISHED)),
+                shown(training.last_metric(way), ".1f") if has_curves else "",
+            ]
+            yield ["" if number else name, way, *(["", ""] if is_mix else cells[:2]), *cells[2:]]
 
 
-def _trainings() -> dict[str, _Training]:
-    found: dict[str, _Training] = {}
-    for call, path in calls_by_date(RESULTS, "packs-nvidia-*.json"):
-        rows = [row for row in call.results.get("rows", ()) if row.get("exit_code") == 0]
-        for name in dict.fromkeys(row["name"] for row in rows):
-            ways: dict[str, list[Mapping[str, Any]]] = {}
-            for row in rows:
-                if row["name"] == name:
-                    ways.setdefault(row["way"], []).append(row)
-            found[name] = _Training(call, path.name, ways)
-    return found
-
-
-def _rows(name: str, training: _Training) -> list[list[str]]:
-    rows = []
-    for way in training.ways:
-        cells = [name if not rows else "", way]
-        for key, form in ((_STEPS, ",.0f"), (_FINISHED, ",.1f")):
-            gained = shown(training.rate(way, key), form), shown(training.over_one(way, key))
-            cells += ("", "") if training.is_mix and key == _STEPS else gained
-        rows.append(cells)
-    return rows
+def eight_packed(name: str) -> dict[str, str]:
+    """What eight of a training at once gain over one, in `n` repeats of its newest call."""
+    calls, way = _of_trainings(), "8 at once, mps"
+    if name not in calls:
+        return {"steps": NOT_MEASURED, "finished": NOT_MEASURED, "n": "0"}
+    training = _Training(calls[name][0], name)
+    steps, finished = (shown(training.over_one(way, key)) for key in (_STEPS, _FINISHED))
+    return {"steps": steps, "finished": finished, "n": str(len(training.ways.get(way, ())))}

@@ -1,71 +1,67 @@
-"""The advice that the measurements add up to, and every other table, so that all have names."""
+"""What the measurements add up to: the advice, and the figures of the front page.
+
+Their words are in `advice.md` and `front.md`. Importing this registers every table.
+"""
 
 from __future__ import annotations
 
-from benchmarks.evaluation import (  # noqa: F401  Each registers its tables.
-    claims,
-    front,
-    learning_tables,
-    off_policy_tables,
-    seed_tables,
-    walking_tables,
-)
+from benchmarks.evaluation import claims, learning_tables, seed_tables  # noqa: F401
 from benchmarks.evaluation.async_tables import asynchronous_gains
-from benchmarks.evaluation.figures import bounds, shown
-from benchmarks.evaluation.pack_tables import packed_gains
+from benchmarks.evaluation.figures import NOT_MEASURED, Figure, bounds, shown
+from benchmarks.evaluation.learning_tables import seconds_to_mark
+from benchmarks.evaluation.other_tables import seconds_to_recover
+from benchmarks.evaluation.pack_tables import CLEANRL, MJLAB, eight_packed
+from benchmarks.evaluation.peer_tables import over_brax
 from benchmarks.evaluation.plots import mps_gains
 from benchmarks.evaluation.sweep_tables import first_gains, program_over_processes
 from benchmarks.evaluation.tables import best_plan_ratios, fixed_total_ratios, over_one_gpu
-from benchmarks.evaluation.writer import TABLES, Rows, table
+from benchmarks.evaluation.writer import TABLES, filled, lines
 
 __all__ = ["TABLES", "advice"]
 
+EIGHT = "8 at once, auto"
 
-@table(
-    "advice",
-    "you have | several GMIs per GPU? | measured (on H200s with ant, unless said)",
-)
-def advice() -> Rows:
+
+@lines("advice")
+def advice() -> list[str]:
     """Who gains from GMIs, and who does not."""
-    eightfold = first_gains().get("8 at once, auto")
-    throughput = first_gains("steady_steps_per_s").get("8 at once, auto")
-    program = [
-        shown(program_over_processes(key)) for key in ("steady_steps_per_s", "trainings_per_hour")
-    ]
-    fixed = bounds([*fixed_total_ratios().values()])
-    peak = bounds([*best_plan_ratios().values()])
-    return [
-        [
-            *("many small runs on one GPU (seeds, a sweep)", "**yes**: `gmijax sweep`"),
-            f"eight runs at once: {shown(throughput)} times the steps/s of one; with start-up, "
-            f"which overlaps, {shown(eightfold)} times as many runs of half a minute per hour",
-        ],
-        [
-            *("many runs that differ only in seed and learning rate", "**no**: one program"),
-            f"eight runs in one process (`gmijax sweep ... sweep.pack=auto`): {program[0]} times "
-            f"the steps/s of eight processes, {program[1]} times the runs per hour (n=1)",
-        ],
-        [
-            *("several trainings of another library on one GPU", "**yes**: `gmijax pack`"),
-            packed_gains(),
-        ],
-        [
-            *("several processes on one GPU anyway", "**yes**, under MPS"),
-            f"{bounds([*mps_gains().values()])} times the steps/s of plain sharing "
-            "(serving ant and humanoid, 2 to 8 GMIs)",
-        ],
-        [
-            *("one large synchronous training run on one GPU", "**no** (the default)"),
-            f"{fixed} times the steps/s of one process with as many environments; each side "
-            f"at its best number of environments, six tasks on H100s: {peak}",
-        ],
-        [
-            *("one training run on several GPUs", "one GMI on each"),
-            f"four GPUs reach {shown(over_one_gpu(4))} times the steps/s of one",
-        ],
-        [
-            *("asynchronous training", "try synchronous training first"),
-            f"{bounds(asynchronous_gains(1))} times the steps/s of synchronous training on one "
-            f"GPU, {bounds(asynchronous_gains(2))} on two (H100s, 100M steps)",
-        ],
-    ]
+    return filled(
+        "advice",
+        eight_steps=shown(first_gains("steady_steps_per_s").get(EIGHT)),
+        eight_finished=shown(first_gains().get(EIGHT)),
+        program_steps=shown(program_over_processes("steady_steps_per_s")),
+        program_finished=shown(program_over_processes("trainings_per_hour")),
+        mjlab=eight_packed(MJLAB),
+        cleanrl=eight_packed(CLEANRL),
+        mps=bounds([*mps_gains().values()]),
+        fixed_total=bounds([*fixed_total_ratios().values()]),
+        best_plans=bounds([*best_plan_ratios().values()]),
+        four_gpus=shown(over_one_gpu(4)),
+        asynchronous_1=bounds(asynchronous_gains(1)),
+        asynchronous_2=bounds(asynchronous_gains(2)),
+    )
+
+
+@lines("front")
+def front() -> list[str]:
+    """What was measured, on which GPU, each with a link to the section that has its file."""
+    beside = [value for value in over_brax() if value is not None]
+    return filled(
+        "front",
+        ant=_of(seconds_to_mark("ant"), ".1f"),
+        humanoid=_of(seconds_to_mark("humanoid"), ".1f"),
+        eight=_of(first_gains("steady_steps_per_s").get(EIGHT), ".2f"),
+        mjlab=eight_packed(MJLAB),
+        cleanrl=eight_packed(CLEANRL),
+        over_brax=bounds(beside),
+        comparisons=str(len(beside)),
+        kill=_of(seconds_to_recover().get("kill"), ".0f"),
+    )
+
+
+def _of(found: Figure | None, form: str) -> dict[str, str]:
+    """A median, and how many runs it is of."""
+    if found is None:
+        return {"median": NOT_MEASURED, "runs": "0 runs"}
+    runs = "1 run" if found.repeats == 1 else f"{found.repeats} runs"
+    return {"median": format(found.median, form), "runs": runs}

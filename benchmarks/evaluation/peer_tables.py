@@ -2,41 +2,62 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Mapping
+from typing import Any
 
-from benchmarks.evaluation.figures import NOT_MEASURED
-from benchmarks.evaluation.writer import lines, link, markdown, origin
-from benchmarks.peers.comparisons import BRAX, COMPARISONS
-from benchmarks.peers.table import HEAD, measured, ratio, row
-from benchmarks.records import RESULTS, Call, calls_by_date
+from benchmarks.evaluation.figures import Figure, figure, over, shown
+from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
+from benchmarks.peers.comparisons import BRAX, COMPARISONS, MJLAB, OURS, case_name
+from benchmarks.records import calls_by_date
 
-PATTERN = "peers-nvidia-*.json"
+HEAD = (
+    "training run | beside | `gmijax.train`, steps/s: | the other, steps/s: | ratio: "
+    "| seconds of the command, `gmijax.train`: | the other:"
+)
 
 
-@lines("peers")
-def peers() -> list[str]:
-    """Every comparison from the newest call that measured both of its sides."""
-    calls = calls_by_date(RESULTS, PATTERN)
-    if not calls:
-        return [f"{'; '.join(COMPARISONS)}: {NOT_MEASURED} (`python -m benchmarks.peers`)."]
-    rows: list[list[str]] = []
-    origins: dict[tuple[str, str], list[str]] = {}
+def measured() -> Calls:
+    """Of every comparison the newest call that measured both of its sides."""
+    calls = calls_by_date("peers-nvidia-*.json")
+    return {
+        name: call
+        for name in COMPARISONS
+        for call in calls
+        if all(_both(call[0].results, name, "steps_per_s"))
+    }
+
+
+@table_of_calls("peers", HEAD, measured, note=str)
+def peers(calls: Calls) -> Rows:
+    """Every comparison."""
     for name in COMPARISONS:
-        call, path = _newest(name) or (None, None)
-        rows.append(row(call.results if call else {}, name))
-        if call and path:
-            origins.setdefault((link(path.name), origin(call)), []).append(name)
-    files = [f"- {file}, {'; '.join(names)}: {made}" for (file, made), names in origins.items()]
-    return [*markdown(HEAD, rows), "", *files]
+        yield row(calls[name][0].results if name in calls else {}, name)
+
+
+def row(results: Mapping[str, Any], comparison: str) -> list[str]:
+    """Cells of a comparison, medians of what was measured."""
+    peer = COMPARISONS[comparison].peer
+    rates = [shown(value, ",.0f") for value in _both(results, comparison, "steps_per_s")]
+    seconds = [shown(value, ".1f") for value in _both(results, comparison, "command_s")]
+    gain = "another task" if peer == MJLAB else shown(_ratio(results, comparison))
+    return [comparison, peer, *rates, gain, *seconds]
 
 
 def over_brax() -> list[float | None]:
     """Steps per second over those of Brax's PPO, of every comparison."""
-    names = [name for name, one in COMPARISONS.items() if one.peer == BRAX]
-    return [ratio(found[0].results, name) for name in names if (found := _newest(name))]
+    calls = {name: call for name, call in measured().items() if COMPARISONS[name].peer == BRAX}
+    return [_ratio(call.results, name) for name, (call, _) in calls.items()]
 
 
-def _newest(comparison: str) -> tuple[Call, Path] | None:
-    """The newest call that measured both sides."""
-    calls = reversed(calls_by_date(RESULTS, PATTERN))
-    return next((one for one in calls if measured(one[0].results, comparison)), None)
+def _ratio(results: Mapping[str, Any], comparison: str) -> float | None:
+    return over(*_both(results, comparison, "steps_per_s"))
+
+
+def _both(results: Mapping[str, Any], comparison: str, key: str) -> list[Figure | None]:
+    """A figure of both sides, ours first."""
+    cases = results.get("cases", {})
+    found = []
+    for trainer in (OURS, COMPARISONS[comparison].peer):
+        runs = cases.get(case_name(comparison, trainer), {}).get("runs", ())
+        found.append(figure([run["summary"][key] for run in runs if "summary" in run]))
+    return found

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
-from benchmarks.evaluation.writer import lines, link, markdown, origin
-from benchmarks.records import RESULTS, Call, calls_by_date
+from benchmarks.evaluation.writer import line_of, lines, markdown
+from benchmarks.records import Call, calls_by_date
 
 PATTERN = "sweeps-nvidia-*.json"
 ONE_AFTER_ANOTHER = "1 at once, auto"
@@ -17,6 +17,7 @@ HEAD = (
 )
 
 Run: TypeAlias = Mapping[str, Any]
+Key = TypeVar("Key")
 
 
 class SameJobs(NamedTuple):
@@ -24,15 +25,15 @@ class SameJobs(NamedTuple):
 
     Attributes:
       calls: that ran them, as lines of Markdown.
-      runs: of each of the calls, those that succeeded, by way.
+      runs: the number of the call, the way, and what succeeded in it.
     """
 
     calls: list[str]
-    runs: list[dict[str, list[Run]]]
+    runs: list[tuple[int, str, Run]]
 
     def rates(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
         """A figure of all sweeps, by way."""
-        return _figures(_by_way(key, runs) for runs in self.runs)
+        return _figures((way, run[key]) for _, way, run in self.runs)
 
     def gains(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
         """A figure over that of one after another, each ratio of one call."""
@@ -42,34 +43,35 @@ class SameJobs(NamedTuple):
         """Jobs per hour over those of as many at once under plain sharing."""
         return self._ratios(lambda way: way.replace(", auto", ", share"), "trainings_per_hour")
 
-    def _ratios(self, base: Callable[[str], str], key: str) -> dict[str, Figure]:
-        ratios: list[dict[str, list[float]]] = []
-        for runs in self.runs:
-            rates = _figures([_by_way(key, runs)])
-            ratios.append(
-                {
-                    way: [rate.median / rates[base(way)].median]
-                    for way, rate in rates.items()
-                    if base(way) in rates and base(way) != way
-                }
-            )
-        return _figures(ratios)
+    def _ratios(self, base_of: Callable[[str], str], key: str) -> dict[str, Figure]:
+        of_call = _figures(((number, way), run[key]) for number, way, run in self.runs)
+        return _figures(
+            (way, found.median / of_call[number, base].median)
+            for (number, way), found in of_call.items()
+            if (base := base_of(way)) != way and (number, base) in of_call
+        )
+
+
+def _figures(values: Iterable[tuple[Key, float | None]]) -> dict[Key, Figure]:
+    """Those with the same key together, without what has no value."""
+    together: dict[Key, list[float]] = {}
+    for key, value in values:
+        if value is not None:
+            together.setdefault(key, []).append(value)
+    return {key: median for key, found in together.items() if (median := figure(found))}
 
 
 def same_jobs() -> dict[str, SameJobs]:
     """By what the jobs are and where they ran, in Markdown; in the order of first calls."""
     found: dict[str, SameJobs] = {}
-    for call, path in calls_by_date(RESULTS, PATTERN):
-        here: dict[str, dict[str, list[Run]]] = {}
+    for number, (call, path) in enumerate(calls_by_date(PATTERN)):
         for run in call.results["runs"]:
             at_once, backend, *tasks = run["way"].split(", ")
             if run["status"] == "completed":
-                by_way = here.setdefault(_described(call, tasks), {})
-                by_way.setdefault(f"{at_once}, {backend}", []).append(run)
-        for what, by_way in here.items():
-            same = found.setdefault(what, SameJobs([], []))
-            same.calls.append(f"- {link(path.name)}: {origin(call)}")
-            same.runs.append(by_way)
+                same = found.setdefault(_described(call, tasks), SameJobs([], []))
+                if number not in {one for one, *_ in same.runs}:
+                    same.calls.append(line_of(path.name, call))
+                same.runs.append((number, f"{at_once}, {backend}", run))
     return found
 
 
@@ -120,19 +122,3 @@ def _described(call: Call, tasks: list[str]) -> str:
 def _order(way: str) -> tuple[str, int]:
     at_once, backend = way.split(" at once, ")
     return backend, int(at_once) if at_once.isdigit() else 0
-
-
-def _by_way(key: str, runs: Mapping[str, Iterable[Run]]) -> dict[str, list[float]]:
-    """A figure of the sweeps of a call, by way; without those that have none."""
-    return {
-        way: [run[key] for run in of_way if run[key] is not None] for way, of_way in runs.items()
-    }
-
-
-def _figures(found: Iterable[dict[str, list[float]]]) -> dict[str, Figure]:
-    """What several calls measured, together."""
-    together: dict[str, list[float]] = {}
-    for one in found:
-        for way, values in one.items():
-            together.setdefault(way, []).extend(values)
-    return {way: median for way, values in together.items() if (median := figure(values))}

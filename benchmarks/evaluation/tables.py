@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 from benchmarks.cases import PLANS, TASKS
 from benchmarks.evaluation.figures import (
@@ -73,6 +72,11 @@ def pair(file: str, case: str, base: str) -> tuple[Figure | None, Figure | None]
     return None, None
 
 
+def compared(one: Figure | None, base: Figure | None) -> list[str]:
+    """Cells of both and of their ratio."""
+    return [*(shown(value, ",.0f") for value in (one, base)), shown(over(one, base))]
+
+
 def exchange_of(file: str, case: str) -> str:
     """By which strategy the GMIs of a case exchanged gradients."""
     found = summaries(file, case)
@@ -96,9 +100,8 @@ def fixed_total_ratios() -> dict[str, float | None]:
 def fixed_total() -> Rows:
     """The same environments in one process on each GPU, and in several."""
     for what, file, case, base in (*ONE_GPU, *OTHERS):
-        found = pair(file, case, base)
-        rates = (shown(value, ",.0f") for value in found)
-        yield [what, f"`{exchange_of(file, case)}`", *rates, shown(over(*found)), f"`{file}`"]
+        found = compared(*pair(file, case, base))
+        yield [what, f"`{exchange_of(file, case)}`", *found, f"`{file}`"]
 
 
 def fastest(task: str, *, several: bool) -> tuple[Figure, str] | None:
@@ -141,10 +144,8 @@ def best_plans() -> Rows:
 def training_backends() -> Rows:
     """MPS against plain sharing, in training."""
     for file, what in (("ant-1gpu", "4 GMIs x 2048"), ("ant-2gpu", "2 GPUs x 2 GMIs x 2048")):
-        names = [f"{what}, {backend}" for backend in ("mps", "share")]
-        rates = (shown(rate(file, name), ",.0f") for name in names)
-        exchange = f"`{exchange_of(file, names[0])}`"
-        yield [what, exchange, *rates, shown(ratio(file, names[0], names[1]))]
+        mps, share = (f"{what}, {backend}" for backend in ("mps", "share"))
+        yield [what, f"`{exchange_of(file, mps)}`", *compared(*pair(file, mps, share))]
 
 
 @table(
@@ -178,22 +179,7 @@ def over_one_gpu(gpus: int) -> float | None:
 def templates() -> Rows:
     """Trainers among their simulators against trainers apart."""
     for task in ("ant", "humanoid"):
-        file = f"templates-{task}"
-        rates = [shown(rate(file, name), ",.0f") for name in TEMPLATES]
-        yield [f"`{task}`", *rates, shown(ratio(file, *TEMPLATES)), "5"]
-
-
-class Gain(NamedTuple):
-    """A reduction in training beside `mpr`; None: not measured.
-
-    Attributes:
-      mpr, own: environment steps per second.
-      ratio: of one call, or of two calls with the same commands.
-    """
-
-    mpr: Figure | None
-    own: Figure | None
-    ratio: float | None
+        yield [f"`{task}`", *compared(*pair(f"templates-{task}", *TEMPLATES)), "5"]
 
 
 def algorithm_1(at: str) -> str:
@@ -202,14 +188,18 @@ def algorithm_1(at: str) -> str:
     return select_strategy(Layout.even(int(gpus), int(gmis))).strategy
 
 
-def gain_of(task: str, at: str, way: str) -> Gain:
-    """A reduction on a layout against `mpr`: of the same call where that has both."""
+def with_and_without(task: str, at: str, way: str) -> tuple[Figure | None, Figure | None]:
+    """Steps/s of a reduction on a layout, and of `mpr`: of the same call where that has both."""
     file = f"lgr-{task}-one_shot" if way == "one_shot" else f"lgr-{task}"
     # Runs of rings that were made by themselves.
     alone = f"lgr-{task}-{way}"
-    mpr = rate(file, f"{at} mpr")
     own = rate(file, f"{at} {way}") or rate(alone, f"{at} {way}")
-    return Gain(mpr, own, over(own, mpr))
+    return own, rate(file, f"{at} mpr")
+
+
+def reduction_gain(task: str, at: str, way: str) -> float | None:
+    """The ratio of the two."""
+    return over(*with_and_without(task, at, way))
 
 
 def _lgr_files() -> Iterator[str]:
@@ -228,13 +218,13 @@ def lgr() -> Rows:
     for task in LGR:
         for way in ("one_shot", "mrr", "har"):
             for at in LAYOUTS:
-                chosen, gain = way == algorithm_1(at), gain_of(task, at, way)
-                if not chosen and gain.own is None:
+                chosen, found = way == algorithm_1(at), with_and_without(task, at, way)
+                if not chosen and found[0] is None:
                     continue
                 paper = f"{lgr_gain(task, at):.2f}" if chosen else "-"
-                cells = [shown(gain.mpr, ",.0f"), shown(gain.own, ",.0f"), shown(gain.ratio)]
+                own, mpr, gain = compared(*found)
                 names = [f"`{task}`", LAYOUTS[at], f"`{way}`", "yes" if chosen else "no"]
-                yield [*names, *cells, paper]
+                yield [*names, mpr, own, gain, paper]
 
 
 @table(
@@ -248,9 +238,8 @@ def num_env() -> Rows:
         for impl in ("jax", "warp"):
             for envs in (512, 2048, 8192, 32768):
                 name, file = f"{task} {impl} {envs}", f"tasks-{impl}"
-                memory = [one["device"]["peak_memory_mib"] for one in summaries(file, name)]
-                cells = [shown(one, ",.0f") for one in (rate(file, name), figure(memory))]
-                yield [f"`{task}`", f"{envs:,}", impl, *cells]
+                found = rate(file, name), rate(file, name, "device/peak_memory_mib")
+                yield [f"`{task}`", f"{envs:,}", impl, *(shown(one, ",.0f") for one in found)]
 
 
 def small_gmis() -> dict[int, float]:

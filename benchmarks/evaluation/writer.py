@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import TypeAlias, TypeVar
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar
 
 from benchmarks.evaluation.figures import NOT_MEASURED, call_of, repeats_of
-from benchmarks.records import Call
+from benchmarks.records import Call, calls_by_date
 
 Rows: TypeAlias = Iterable[Sequence[str]]
+Calls: TypeAlias = Mapping[Any, tuple[Call, Path]]
+"""The calls that a table is of, with their files, by what tells them apart."""
 MakeRows = TypeVar("MakeRows", bound=Callable[[], Rows])
+MakeRowsOfCalls = TypeVar("MakeRowsOfCalls", bound=Callable[[Calls], Rows])
 MakeLines = TypeVar("MakeLines", bound=Callable[[], list[str]])
 
 TABLES: dict[str, Callable[[], list[str]]] = {}
@@ -35,6 +39,52 @@ def table(
     return register
 
 
+def table_of_calls(
+    name: str,
+    head: str,
+    find: Callable[[], Calls],
+    note: Callable[[Any], str] = lambda _: "",
+    *,
+    is_brief: bool = False,
+) -> Callable[[MakeRowsOfCalls], MakeRowsOfCalls]:
+    """Registers a function of the rows of some calls as a table.
+
+    Args:
+      name: in documents.
+      head: see `markdown`.
+      find: the calls.
+      note: what is said of a call beside its file, by its key.
+      is_brief: calls of which nothing else is said stand once.
+    """
+
+    def register(rows: MakeRowsOfCalls) -> MakeRowsOfCalls:
+        def make() -> list[str]:
+            if not (found := find()):
+                return [NOT_MEASURED]
+            made = made_with(found, note)
+            below = dict.fromkeys(made) if is_brief else made
+            return [*markdown(head, [*rows(found)]), "", *below]
+
+        TABLES[name] = make
+        return rows
+
+    return register
+
+
+def newest(pattern: str, key: Callable[[Call], Any]) -> Calls:
+    """The newest call of each kind, in the files of results that match."""
+    return {key(call): (call, path) for call, path in calls_by_date(pattern)}
+
+
+def made_with(calls: Calls, note: Callable[[Any], str] = lambda _: "") -> list[str]:
+    """A line for each call: its file, the notes of its keys, and with what it was made."""
+    found: dict[tuple[str, str | None], tuple[Call, list[str]]] = {}
+    for key, (call, path) in calls.items():
+        _, notes = found.setdefault((path.name, call.date), (call, []))
+        notes += filter(None, [note(key)])
+    return [line_of(file, call, "; ".join(notes)) for (file, _), (call, notes) in found.items()]
+
+
 def lines(name: str) -> Callable[[MakeLines], MakeLines]:
     """Registers a function that writes all lines of a table itself."""
 
@@ -43,6 +93,11 @@ def lines(name: str) -> Callable[[MakeLines], MakeLines]:
         return make
 
     return register
+
+
+def filled(name: str, **values: str | Mapping[str, str]) -> list[str]:
+    """The table in `<name>.md`, with figures in the places of their names."""
+    return (Path(__file__).parent / f"{name}.md").read_text().format(**values).splitlines()
 
 
 def markdown(head: str, rows: Sequence[Sequence[str]]) -> list[str]:
@@ -55,20 +110,16 @@ def markdown(head: str, rows: Sequence[Sequence[str]]) -> list[str]:
 
 def source(*files: str) -> list[str]:
     """A line for each file: with what its call was made."""
-    below = [
-        *(
-            f"- {link(f'{file}.json')}: {origin(call)}"
-            if (call := call_of(file))
-            else f"- `{file}.json`: {NOT_MEASURED}"
-            for file in files
-        ),
-    ]
+    below = [line_of(f"{file}.json", call_of(file)) for file in files]
     return ["", *below] if below else []
 
 
-def link(file_name: str) -> str:
-    """A file of results, as a page in `docs/evaluation/` points at it."""
-    return f"[`{file_name}`](../../benchmarks/results/{file_name})"
+def line_of(file: str, call: Call | None, note: str = "") -> str:
+    """A call of a file of results, as a page in `docs/evaluation/` points at it."""
+    if call is None:
+        return f"- `{file}`: {NOT_MEASURED}"
+    link = f"[`{file}`](../../benchmarks/results/{file})"
+    return f"- {link}{', ' if note else ''}{note}: {origin(call)}"
 
 
 def origin(call: Call) -> str:

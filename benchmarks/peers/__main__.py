@@ -17,29 +17,27 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from benchmarks.evaluation.peer_tables import HEAD, row
 from benchmarks.evaluation.writer import markdown
-from benchmarks.peers.comparisons import COMPARISONS, MJLAB, missing_package
+from benchmarks.peers.comparisons import COMPARISONS, MJLAB, OURS, missing_package
 from benchmarks.peers.side import Side
-from benchmarks.peers.table import HEAD, OURS, row
-from benchmarks.records import ResultsFile, device_name, file_name
+from benchmarks.records import results_file
 from benchmarks.runner import (
     STOP_S,
+    Command,
     as_word,
     deadline,
     exit_code,
+    failures_of,
     in_turn,
     options,
-    start,
-    wait_until,
 )
 from benchmarks.steady import settled_rate
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
-from gmijax.supervise.failures import last_line
 
 CURVE_POINTS = 60
 
@@ -50,9 +48,7 @@ class Benchmark:
     def __init__(self, given: argparse.Namespace, scratch: Path, sides: Sequence[Side]) -> None:
         self._given, self._scratch, self._sides = given, scratch, list(sides)
         self._deadline_s = deadline(given.deadline_s)
-        self.file = ResultsFile(
-            given.out / file_name("peers", device_name()), "peers", vars(given)
-        )
+        self.file = results_file(given, "peers")
         self._runs: dict[Side, list[dict[str, Any]]] = {side: [] for side in sides}
         self.file.results["cases"] = {
             str(side): {"told": side.told, "runs": runs} for side, runs in self._runs.items()
@@ -73,13 +69,13 @@ class Benchmark:
 
     def _compile(self, sides: Sequence[Side]) -> None:
         """Short runs at the same time; a side that fails is not tried again."""
+        has_gpu = bool(detect_machine().gpus)
         folders = [self._new_folder(side, "compile") for side in sides]
         commands = [
-            side.short_command(folder, has_gpu=bool(detect_machine().gpus))
+            self._command(side, side.short_command(folder, has_gpu=has_gpu), folder, is_short=True)
             for side, folder in zip(sides, folders, strict=True)
         ]
-        failures = self._train(sides, folders, commands, is_short=True)
-        for side, failure in zip(sides, failures, strict=True):
+        for side, failure in zip(sides, self._failures(*commands), strict=True):
             if failure:
                 self._add(side, {"repeat": 0, "failed": failure})
                 self._sides.remove(side)
@@ -87,51 +83,34 @@ class Benchmark:
     def _run(self, side: Side, repeat: int) -> dict[str, Any]:
         """One training as a whole command."""
         folder, started_s = self._new_folder(side, str(repeat)), time.monotonic()
-        command = side.command(folder, seed=repeat)
-        (failure,) = self._train([side], [folder], [command], is_short=False)
+        command = self._command(side, side.command(folder, seed=repeat), folder)
+        (failure,) = self._failures(command)
         command_s = time.monotonic() - started_s
         curve = [] if failure else side.curve(folder)
         rate = settled_rate(curve) if curve else None
         if rate is None:
-            return {"repeat": repeat, "failed": failure or self._reason(folder, 0)}
+            return {"repeat": repeat, "failed": failure or "too few reports"}
         summary = {"steps_per_s": rate, "command_s": command_s, "env_steps": curve[-1][1]}
         kept = curve[:: max(1, len(curve) // CURVE_POINTS)]
         return {"repeat": repeat, "summary": summary, "curve": kept}
 
-    def _train(
-        self,
-        sides: Sequence[Side],
-        folders: Sequence[Path],
-        commands: Sequence[Sequence[str]],
-        *,
-        is_short: bool,
-    ) -> list[str | None]:
-        """Runs commands at the same time; why each failed, None of those that did not."""
-        with ExitStack() as logs:
-            processes = [
-                start(
-                    command,
-                    side.variables(self._scratch / "xla", is_short=is_short),
-                    logs.enter_context((folder / "log").open("wb")),
-                )
-                for side, folder, command in zip(sides, folders, commands, strict=True)
-            ]
-            timeout_s = min(self._deadline_s, deadline(self._given.timeout_s + STOP_S))
-            codes = wait_until(timeout_s, *processes)
-        found = zip(folders, codes, strict=True)
-        return [self._reason(folder, code) if code else None for folder, code in found]
+    def _command(
+        self, side: Side, words: Sequence[str], folder: Path, *, is_short: bool = False
+    ) -> Command:
+        return Command(words, folder, side.variables(self._scratch / "xla", is_short=is_short))
+
+    def _failures(self, *commands: Command) -> list[str | None]:
+        found = failures_of(
+            commands, min(self._deadline_s, deadline(self._given.timeout_s + STOP_S))
+        )
+        is_over = time.monotonic() > self._deadline_s - STOP_S
+        return ["ended by the deadline" if one and is_over else one for one in found]
 
     def _add(self, side: Side, run: dict[str, Any]) -> None:
         with self.file.changing():
             self._runs[side].append(run)
         shown = run.get("summary") or {"failed": run["failed"]}
-        sys.stdout.write(f"{side}: {json.dumps(shown)}\n")
-        sys.stdout.flush()
-
-    def _reason(self, folder: Path, code: int) -> str:
-        if time.monotonic() > self._deadline_s - STOP_S:
-            return "ended by the deadline"
-        return last_line(folder / "log") or f"exit code {code}"
+        print(f"{side}: {json.dumps(shown)}", flush=True)
 
     def _new_folder(self, side: Side, what: str) -> Path:
         self._scratch.mkdir(parents=True, exist_ok=True)

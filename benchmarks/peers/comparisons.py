@@ -11,7 +11,7 @@ from gmijax.cli.compose import compose
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, PpoConfig, TrainConfig
 from gmijax.errors import ConfigError
 
-BRAX, MJLAB = "Brax", "mjlab"
+OURS, BRAX, MJLAB = "gmijax", "Brax", "mjlab"
 MJLAB_TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
 
 REPORTS = 10
@@ -112,6 +112,11 @@ COMPARISONS: Mapping[str, Comparison] = MappingProxyType(
         ),
     }
 )
+
+
+def case_name(comparison: str, trainer: str) -> str:
+    """Under which the runs of one side stand."""
+    return f"{comparison}, {trainer}"
 
 
 class BraxTraining(NamedTuple):

@@ -9,18 +9,14 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from benchmarks.peers.comparisons import Comparison, brax_training
 from benchmarks.peers.side import variables_of_brax
-from benchmarks.records import ResultsFile, device_name, file_name
-from benchmarks.runner import deadline, exit_code, options, start, wait_until
+from benchmarks.records import results_file
+from benchmarks.runner import Command, deadline, exit_code, failures_of, options
 from gmijax.runs.folder import read_json, write_json
-from gmijax.supervise.failures import last_line
-
-SUITE = "brax-returns"
 
 
 def told(task: str, more: tuple[str, ...], seed: int) -> dict[str, Any]:
@@ -41,27 +37,22 @@ def told(task: str, more: tuple[str, ...], seed: int) -> dict[str, Any]:
     )._asdict()
 
 
-def train(tasks: dict[str, dict[str, Any]], folder: Path, timeout_s: float) -> dict[str, Any]:
-    """Trains all at once; the returns by steps of each, or why it has none."""
-    with ExitStack() as logs:
-        processes = []
-        for name, training in tasks.items():
-            files = [folder / f"{name}.{part}" for part in ("in.json", "out.json", "log")]
-            write_json(files[0], training)
-            command = [sys.executable, "-m", "benchmarks.peers.brax_ppo", *map(str, files[:2])]
-            log = logs.enter_context(files[2].open("wb"))
-            processes.append(start(command, variables_of_brax(training["suite"]), log))
-        codes = wait_until(deadline(timeout_s), *processes)
-    return {name: _run(folder, name, code) for name, code in zip(tasks, codes, strict=True)}
-
-
-def _run(folder: Path, name: str, code: int) -> dict[str, Any]:
-    """Its returns, up to where it failed."""
-    out = folder / f"{name}.out.json"
-    run = {"returns": read_json(out)["returns"] if out.exists() else []}
-    if code:
-        run["failed"] = last_line(folder / f"{name}.log") or f"exit code {code}"
-    return run
+def train(tasks: dict[str, dict[str, Any]], root: Path, timeout_s: float) -> dict[str, Any]:
+    """Trains all at once; of each the returns by steps, up to where it failed, and why it did."""
+    commands = []
+    for name, training in tasks.items():
+        folder = root / name
+        folder.mkdir()
+        write_json(folder / "in.json", training)
+        files = (str(folder / file) for file in ("in.json", "out.json"))
+        words = [sys.executable, "-m", "benchmarks.peers.brax_ppo", *files]
+        commands.append(Command(words, folder, variables_of_brax(training["suite"])))
+    runs: dict[str, Any] = {}
+    for name, failure in zip(tasks, failures_of(commands, deadline(timeout_s)), strict=True):
+        out = root / name / "out.json"
+        returns = read_json(out)["returns"] if out.exists() else []
+        runs[name] = {"returns": returns, **({"failed": failure} if failure else {})}
+    return runs
 
 
 def main() -> int:
@@ -76,7 +67,7 @@ def main() -> int:
     given = parser.parse_args()
     names = {f"{task}-{seed}": (task, seed) for task in given.tasks for seed in range(given.seeds)}
     tasks = {name: told(task, tuple(given.override), seed) for name, (task, seed) in names.items()}
-    file = ResultsFile(given.out / file_name(SUITE, device_name()), SUITE, vars(given))
+    file = results_file(given, "brax-returns")
     with tempfile.TemporaryDirectory() as scratch:
         found = train(tasks, Path(scratch), given.timeout_s)
     with file.changing() as results:

@@ -13,11 +13,12 @@ from benchmarks.peers.comparisons import (
     BRAX,
     COMPARISONS,
     MJLAB,
+    OURS,
     REPORTS,
     brax_training,
+    case_name,
     mjlab_training,
 )
-from benchmarks.peers.table import OURS, case_name
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.history import read_metrics
 

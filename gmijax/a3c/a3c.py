@@ -22,7 +22,6 @@ from gmijax.a3c.targets import (
 )
 from gmijax.collectives.interface import Collectives, Communicator, TracedStep
 from gmijax.config import A3cConfig
-from gmijax.decoupled.algorithm import UpdateResult
 from gmijax.learning.learner import (
     TrainState,
     acting_moments,
@@ -157,6 +156,22 @@ def gradients(
     )
 
 
+class UpdateResult(NamedTuple):
+    """Results of an update, beside the state.
+
+    Attributes:
+      weights: [W] float32, to publish; see `pack_weights`.
+      losses: means over all minibatches of all trainers, [] each.
+      rates: of all minibatches, see `rate_figures`.
+      explained_variance: [], see the function of this name.
+    """
+
+    weights: Array
+    losses: A3cLosses
+    rates: dict[str, Array]
+    explained_variance: Array
+
+
 def make_update(learner: A3cLearner, comm: Communicator) -> TracedStep:
     """The update as a program: `(state, (batch, weight)) -> (state, (), Updated)`.
 
@@ -190,5 +205,4 @@ def update(
     weights = pack_weights(acting_weights(learner, state))
     means = jax.tree.map(jnp.mean, losses)
     explained = explained_variance(target, error)
-    figures = {"value/explained_variance": explained}
-    return state, (), UpdateResult(weights, means, rate_figures(learner.config, rates), figures)
+    return state, (), UpdateResult(weights, means, rate_figures(learner.config, rates), explained)

@@ -36,6 +36,7 @@ from gmijax.errors import (
 from gmijax.machine.differences import differences_in
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.supervise.backends import open_backend
+from gmijax.supervise.environment import NCCL_INTERFACE
 from gmijax.supervise.gmi_process import GmiProcess
 from gmijax.supervise.heartbeat import Heartbeat
 from gmijax.supervise.run_gmis import drop_unreadable, shared_blocks
@@ -195,6 +196,9 @@ class TrainingNode(Node):
         found = dict(backend.daemons)
         if layout.num_nodes == 1:
             return NodeEndpoints((address, 0), {}, found)
+        if (interface := interface_of(address)) is not None:
+            # By the network of the other exchanges; GMIs inherit it. `=`: this name, no beginning.
+            os.environ.setdefault(NCCL_INTERFACE, f"={interface}")
         self._listener = self._held.enter_context(listen(address))
         self._blocks[ENV_LISTENER_FD] = self._listener.fileno()
         calls = {
@@ -283,17 +287,28 @@ def address_of(interface: str) -> str:
     Raises:
       ConfigError: there is no such one here, or it has none.
     """
+    if (address := _ipv4_of(interface)) is None:
+        names = ", ".join(name for _, name in socket.if_nameindex())
+        raise ConfigError(
+            f"cluster.interface={interface}: node {platform.node()} has no such interface "
+            f"with an IPv4 address; it has {names}"
+        )
+    return address
+
+
+def interface_of(address: str) -> str | None:
+    """The network interface with this IPv4 address; None if it is not the first of any."""
+    names = (name for _, name in socket.if_nameindex())
+    return next((name for name in names if _ipv4_of(name) == address), None)
+
+
+def _ipv4_of(interface: str) -> str | None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         request = struct.pack("256s", interface.encode()[:15])
-        try:
+        with suppress(OSError):
             answer: Any = fcntl.ioctl(asking.fileno(), _SIOCGIFADDR, request)
-        except OSError:
-            names = ", ".join(name for _, name in socket.if_nameindex())
-            raise ConfigError(
-                f"cluster.interface={interface}: node {platform.node()} has no such interface "
-                f"with an IPv4 address; it has {names}"
-            ) from None
-    return socket.inet_ntoa(answer[20:24])
+            return socket.inet_ntoa(answer[20:24])
+    return None
 
 
 def _remove_if_empty(folder: Path) -> None:

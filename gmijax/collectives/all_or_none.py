@@ -20,7 +20,7 @@ NOTE_BYTES = 240
 
 
 def all_or_none(group: Group, what: str, step: Callable[[], bytes]) -> npt.NDArray[np.uint8]:
-    """Does a step of the start; returns what it returned on the ranks of this node.
+    """Does a step of the start; returns what it returned on all ranks.
 
     Collective: all ranks of the job call it, and they go on together or not at all.
 
@@ -30,7 +30,7 @@ def all_or_none(group: Group, what: str, step: Callable[[], bytes]) -> npt.NDArr
       step: returns at most NOTE_BYTES.
 
     Returns:
-      [k, NOTE_BYTES], by rank in the node.
+      [K, NOTE_BYTES], by rank in the job.
 
     Raises:
       DeviceMemoryUnavailable: it failed on one of them, and why it did there.
@@ -51,5 +51,4 @@ def all_or_none(group: Group, what: str, step: Callable[[], bytes]) -> npt.NDArr
         why = notes[failed[0]].tobytes().rstrip(b"\0").decode(errors="replace")
         gmi = int(rows[failed[0], 0]) - 1
         raise DeviceMemoryUnavailable(f"{what}: GMI {gmi}: {why}")
-    first = group.rank - local.rank
-    return notes[first : first + local.world_size]
+    return notes

@@ -15,11 +15,12 @@ from gmijax.collectives.host.shared_block import LANES
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.interface import Communicator, FloatBuffer, Step, TracedStep
+from gmijax.collectives.nodes.leader_watch import LeaderWatch
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.nodes.rendezvous import NodeAddresses, connect
 from gmijax.collectives.program import ProgramStep, StagedAllReduce
-from gmijax.collectives.strategies import stages
+from gmijax.collectives.strategies import inside_nodes, stages
 from gmijax.errors import ConfigError, DeviceMemoryUnavailable
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import require_strategy, why_no_bindings
@@ -42,6 +43,7 @@ class CommunicatorConfig:
       timeout_s: longest wait for other ranks.
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
       intra: how the GMIs of one GPU exchange numbers in HAR, `host` or `ipc`.
+      inter: how nodes exchange them, `nccl` or `tcp`; None where there is one.
       host_if_unavailable: whether ranks go through host memory, with a warning, where the memory
         of GPUs cannot be shared.
       nodes: in a job on several nodes what its leaders know of each other.
@@ -56,6 +58,7 @@ class CommunicatorConfig:
     timeout_s: float
     rendezvous_timeout_s: float
     intra: str = "host"
+    inter: str | None = None
     host_if_unavailable: bool = False
     nodes: NodeAddresses | None = None
     listener: socket.socket | None = None
@@ -75,6 +78,12 @@ def make_communicator(strategy: str, config: CommunicatorConfig) -> Communicator
     if config.layout.num_gmis == 1:
         return SingleRankCommunicator(strategy)
     control, host = _lanes(config)
+    if config.inter == "nccl":
+        try:
+            return _built(strategy, config, control, host)
+        except DeviceMemoryUnavailable as error:
+            config = replace(config, inter="tcp")
+            warnings.warn(f"{error}; so nodes exchange by TCP", RuntimeWarning, stacklevel=2)
     try:
         return _built(strategy, config, control, host)
     except DeviceMemoryUnavailable as error:
@@ -88,19 +97,24 @@ def make_communicator(strategy: str, config: CommunicatorConfig) -> Communicator
 
 def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lane) -> Communicator:
     layout, num_floats = config.layout, _capacity(config)
-    parts = stages(strategy, layout, config.intra)
+    parts = stages(strategy, layout, config.intra, config.inter)
     device, transport = DEVICE(), None
     try:
+        if config.inter == "nccl" and (device is None or device.new_ring is None):
+            raise ConfigError("exchanges between nodes by NCCL need GPUs")
         if device is None or all(stage.transport in ("host", "nodes") for stage in parts):
             transport = HostTransport(host, num_floats)
         else:
             transport = DeviceTransport(control, host, layout, num_floats, parts, device)
-        all_reduce = trial = StagedAllReduce(transport, parts, host.rank, host.world_size)
-        inside = [stage for stage in parts if stage.transport != "nodes"]
+        ranks = host.rank, host.world_size
+        all_reduce = StagedAllReduce(transport, parts, *ranks)
+        inside = inside_nodes(parts, layout)
+        trials = [all_reduce.is_right]
         if len(inside) < len(parts):
-            # Who finds that it does not work must not leave other nodes waiting for a sum.
-            trial = StagedAllReduce(transport, inside, host.local.rank, host.local.world_size)
-        transport.start(trial.is_right)
+            # A rank that finds that it does not work must not leave other nodes waiting for a sum.
+            first = StagedAllReduce(transport, inside, *ranks).is_right
+            trials = [first, *trials] if config.inter == "nccl" else [first]
+        transport.start(trials)
     except BaseException as error:
         if transport is not None:
             transport.close()
@@ -108,7 +122,7 @@ def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lan
             host.close()
             control.close()
         raise
-    return MultiRankCommunicator(strategy, config.intra, control, host, all_reduce)
+    return MultiRankCommunicator(strategy, config, control, host, all_reduce)
 
 
 class MultiRankCommunicator:
@@ -117,13 +131,13 @@ class MultiRankCommunicator:
     def __init__(
         self,
         strategy: str,
-        intra: str,
+        config: CommunicatorConfig,
         control: _Lane,
         host: _Lane,
         all_reduce: StagedAllReduce,
     ) -> None:
         self.rank, self.world_size = host.rank, host.world_size
-        self.strategy, self.intra = strategy, intra
+        self.strategy, self.intra, self.inter = strategy, config.intra, config.inter
         self._control, self._host, self._all_reduce = control, host, all_reduce
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
@@ -145,6 +159,7 @@ class SingleRankCommunicator:
     """The `Communicator` of a job with one trainer."""
 
     rank, world_size, intra = 0, 1, "host"
+    inter: str | None = None
 
     def __init__(self, strategy: str = "none") -> None:
         self.strategy = strategy
@@ -188,9 +203,10 @@ def _over_nodes(
         raise ConfigError(f"layout {layout} on {layout.num_nodes} nodes: needs their addresses")
     with listener:
         if rank != leader:
-            return [MultiNodeGroup(lane, layout, rank, None) for lane in lanes]
-        sockets = connect(nodes, listener, len(lanes), config.rendezvous_timeout_s)
+            return [MultiNodeGroup(lane, layout, rank) for lane in lanes]
+        *sockets, watched = connect(nodes, listener, len(lanes) + 1, config.rendezvous_timeout_s)
     leaders = [_ids(config)[ranks[0]] for ranks in layout.gmis_of_node]
+    watch = LeaderWatch(watched, nodes.node, leaders)
     meshes = [
         Mesh(
             *(connections, nodes.node, leaders),
@@ -200,8 +216,11 @@ def _over_nodes(
         )
         for connections, lane in zip(sockets, lanes, strict=True)
     ]
+    # The first lane is that of the thread which waits while the device is at a step.
+    watches = [watch, None]
     return [
-        MultiNodeGroup(lane, layout, rank, mesh) for lane, mesh in zip(lanes, meshes, strict=True)
+        MultiNodeGroup(lane, layout, rank, mesh, watch)
+        for lane, mesh, watch in zip(lanes, meshes, watches, strict=True)
     ]
 
 

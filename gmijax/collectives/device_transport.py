@@ -9,6 +9,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
@@ -73,9 +74,8 @@ class Device(NamedTuple):
     Attributes:
       new_memory: makes or opens memory that processes share.
       new_queue: adds work to streams, with flags [whole pages, line].
-      new_ring: makes this rank's ring, from groups of ranks in the node; all ranks of the job
-        call it, and get None if they are in none of the groups. None itself where rings go
-        through the host.
+      new_ring: makes this rank's ring, from groups of ranks; all ranks of the job call it, and
+        get None if they are in none of the groups. None itself where rings go through the host.
     """
 
     new_memory: NewMemory
@@ -86,8 +86,8 @@ class Device(NamedTuple):
 class DeviceTransport(HostTransport):
     """Moves numbers on the device's stream; all ranks of the job make theirs together.
 
-    Stages through the host and between nodes go the way of `HostTransport`, as do rings on a CPU.
-    What lies on a device's stream is of one node, by ranks in the node.
+    Stages through the host and sockets go the way of `HostTransport`, as do rings on a CPU. Shared
+    memory of devices is of one node, by ranks in the node; rings may go over several.
 
     Args:
       control: this rank's use of the shared block from outside of programs.
@@ -114,7 +114,7 @@ class DeviceTransport(HostTransport):
         super().__init__(host, num_floats)
         self._control, self._here = control, control.local
         self._device = device
-        self._runner = LockstepRunner(self._here, num_floats)
+        self._runner = LockstepRunner(control, num_floats)
         self._queue: CudaQueue | None = None
         self._desync: DesyncDetector | None = None
         self._ipc: IpcBuffers | None = None
@@ -124,9 +124,7 @@ class DeviceTransport(HostTransport):
                 self._ipc = self._new_ipc(layout, stages, device.new_memory)
             if (new_ring := device.new_ring) is not None:
                 rings = {stage.groups for stage in stages if stage.transport == "ring"}
-                self._rings = {
-                    groups: new_ring(control, control.of_node(groups)) for groups in sorted(rings)
-                }
+                self._rings = {groups: new_ring(control, groups) for groups in sorted(rings)}
         except BaseException:
             self.close()
             raise
@@ -144,11 +142,12 @@ class DeviceTransport(HostTransport):
             owners = first[near:] + first[:near]
         return IpcBuffers(self._control, self.capacity, group, owners, new_memory, _WISH)
 
-    def start(self, trial: Callable[[], bool]) -> None:
+    def start(self, trials: Sequence[Callable[[], bool]]) -> None:
         """See `HostTransport`."""
         all_or_none(self._control, _WISH, self._open)
-        failure = self._runner.finish(lambda: self._try(trial))
-        all_or_none(self._control, _WISH, lambda: _raise(failure))
+        for trial in trials:
+            failure = self._runner.finish(partial(self._try, trial))
+            all_or_none(self._control, _WISH, partial(_raise, failure))
         self.exchange_s()  # Not a part of the first step.
 
     def reduce(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import jax
@@ -37,11 +37,11 @@ class HostTransport:
         self._exchange_s = 0.0
         self._pinned: dict[str, FloatBuffer] = {}  # On a GPU: what exchanges go through.
 
-    def start(self, trial: Callable[[], bool]) -> None:
+    def start(self, trials: Sequence[Callable[[], bool]]) -> None:
         """Makes sure that it works, together with all other ranks.
 
         Args:
-          trial: collectives in the node; whether their results are right.
+          trials: collectives, one after the other; whether their results are right.
 
         Raises:
           DeviceMemoryUnavailable: they do not work; on all ranks alike.

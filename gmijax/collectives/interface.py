@@ -107,12 +107,14 @@ class Communicator(Protocol):
       world_size: K, number of trainers.
       strategy: which one it is, also where the wanted one was not to be had.
       intra: how the GMIs of one GPU exchange numbers in `har`, `host` or `ipc`.
+      inter: how nodes exchange numbers, `nccl` or `tcp`; None where there is one.
     """
 
     rank: int
     world_size: int
     strategy: str
     intra: str
+    inter: str | None
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """Returns [K, M]: `values` [M] float32 of every rank, in order of rank.

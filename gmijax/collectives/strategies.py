@@ -6,6 +6,7 @@ No jax.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -15,8 +16,8 @@ from gmijax.partition.reduction import is_even, leaders
 
 Kind: TypeAlias = Literal["all_reduce", "all_gather", "broadcast"]
 TransportName: TypeAlias = Literal["host", "ipc", "ring", "nodes"]
-"""Through shared memory of the host, memory of the GPUs that all map, NCCL between GPUs, sockets
-between nodes and memory of the host in each."""
+"""Through shared memory of the host, memory of the GPUs that all map, NCCL between GPUs (of one
+node or several), sockets between nodes and memory of the host in each."""
 
 Groups: TypeAlias = tuple[tuple[int, ...], ...]
 """Ranks that exchange with each other; no rank is in two of them, some may be in none."""
@@ -45,7 +46,9 @@ class ReductionStage(NamedTuple):
         return True
 
 
-def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[ReductionStage]:
+def stages(
+    strategy: str, layout: Layout, intra: str = "host", inter: str | None = None
+) -> Sequence[ReductionStage]:
     """What ranks do one after the other to have the sum over all of them, by strategy.
 
     - `mpr`, multi-process reduction: all through the host.
@@ -59,58 +62,102 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Reduc
       travels is K - t buffers to each GPU, for a ring of K it would be two: it is made for
       networks whose messages cost more than their bytes.
 
-    On several nodes each of them does that inside, then their first ranks sum, and give it to the
-    others of their nodes.
+    On several nodes each of them does that inside. Then by `tcp` their first ranks sum, and give
+    it to the others of their nodes. By `nccl` rings go over all nodes: with one GMI on each GPU
+    one ring is all there is; the last ring of `mrr` and the ring between the GPUs of `har` have
+    members on all nodes; with `one_shot` and `mpr` the first ranks of the nodes form a ring.
 
     Args:
       strategy: a key of `COSTS`.
       layout: where the ranks live; the strategy must be allowed there.
       intra: `host` or `ipc`, the transport inside a GPU for `har`.
+      inter: `nccl` or `tcp`, between nodes; None: by TCP if there are several.
     """
-    if layout.num_nodes > 1:
+    if layout.num_nodes > 1 and inter != "nccl":
         return _over_nodes(stages(strategy, layout.of_node(0), intra), layout.gmis_of_node)
-    gpus, everyone = layout.gmis_of_gpu, (tuple(layout.gmis),)
+    gpus = layout.gmis_of_gpu
     if strategy == "mpr":
-        return [ReductionStage("all_reduce", "host", everyone)]
-    if strategy == "flat":
-        return [ReductionStage("all_reduce", "ring", everyone)]
+        return _and_between("all_reduce", "host", layout.gmis_of_node)
     if strategy == "one_shot":
-        return [ReductionStage("all_gather", "ipc", everyone)]
-    rings = tuple(zip(*gpus, strict=True)) if is_even(layout) else ()
-    return _multi_ring(rings) if strategy == "mrr" else _hierarchical(layout, rings, intra)
+        return _and_between("all_gather", "ipc", layout.gmis_of_node)
+    if layout.num_gmis == layout.num_gpus and (strategy != "har" or layout.num_nodes > 1):
+        return [ReductionStage("all_reduce", "ring", (tuple(itertools.chain(*gpus)),))]
+    return _multi_ring(layout) if strategy == "mrr" else _hierarchical(layout, intra)
 
 
-def _multi_ring(rings: Groups) -> Sequence[ReductionStage]:
-    """`mrr` with these rings, one for every index on a GPU."""
-    if len(rings) == 1:
-        return [ReductionStage("all_reduce", "ring", rings)]
-    # Ring k ends on GPU k: the ends are on different GPUs, as NCCL asks.
-    ends = tuple(ring[index] for index, ring in enumerate(rings))
+def inside_nodes(parts: Sequence[ReductionStage], layout: Layout) -> Sequence[ReductionStage]:
+    """The stages before the first one that needs another node."""
+    return list(itertools.takewhile(lambda stage: not _crosses_nodes(stage, layout), parts))
+
+
+def values_after(parts: Sequence[ReductionStage], values: Sequence[int]) -> list[int]:
+    """What ranks that begin with these numbers, by rank, have after these stages."""
+    found = list(values)
+    for stage in parts:
+        if stage.transport == "nodes":
+            found = [sum(found[group[0]] for group in stage.groups)] * len(found)
+            continue
+        for group in stage.groups:
+            is_sum = stage.kind != "broadcast"
+            result = sum(found[rank] for rank in group) if is_sum else found[group[0]]
+            for rank in group:
+                found[rank] = result
+    return found
+
+
+def _crosses_nodes(stage: ReductionStage, layout: Layout) -> bool:
+    homes = ({layout.node_of(rank) for rank in group} for group in stage.groups)
+    return stage.transport == "nodes" or any(len(nodes) > 1 for nodes in homes)
+
+
+def _and_between(kind: Kind, transport: TransportName, nodes: Groups) -> Sequence[ReductionStage]:
+    """One stage in each node, and if there are several a ring of their first ranks, and back."""
+    inside = ReductionStage(kind, transport, nodes)
+    if len(nodes) == 1:
+        return [inside]
+    between = ReductionStage("all_reduce", "ring", (tuple(node[0] for node in nodes),))
+    if len(nodes[0]) == 1:
+        return [between]
+    return [inside, between, inside._replace(kind="broadcast")]
+
+
+def _multi_ring(layout: Layout) -> Sequence[ReductionStage]:
+    """`mrr` where GPUs have several GMIs: in each node a ring for every index on a GPU."""
+    each = layout.num_gpus // layout.num_nodes
+    rings: list[tuple[int, ...]] = []
+    ends: list[int] = []
+    for node in range(layout.num_nodes):
+        here = zip(*layout.gmis_of_gpu[node * each : (node + 1) * each], strict=True)
+        for index, ring in enumerate(here):
+            # Ring k ends on GPU k: the ends are on different GPUs, as NCCL asks.
+            rings.append(ring)
+            ends.append(ring[index])
     back = tuple(_first(end, ring) for end, ring in zip(ends, rings, strict=True))
     return [
-        ReductionStage("all_reduce", "ring", rings),
-        ReductionStage("all_reduce", "ring", (ends,)),
+        ReductionStage("all_reduce", "ring", tuple(rings)),
+        ReductionStage("all_reduce", "ring", (tuple(ends),)),
         ReductionStage("broadcast", "ring", back),
     ]
 
 
-def _hierarchical(layout: Layout, rings: Groups, intra: str) -> Sequence[ReductionStage]:
-    """`har`; `rings` are those of `mrr`, none where GPUs have different numbers of GMIs."""
+def _hierarchical(layout: Layout, intra: str) -> Sequence[ReductionStage]:
+    """`har`."""
     gpus = layout.gmis_of_gpu
     inner: TransportName = "ipc" if intra == "ipc" else "host"
     led = tuple(_first(leader, gpu) for leader, gpu in zip(leaders(layout), gpus, strict=True))
     inside = ReductionStage("all_gather" if inner == "ipc" else "all_reduce", inner, led)
     if len(gpus) == 1:
         return [inside]
-    if inner == "ipc" and rings:
+    # Between nodes a ring of all GMIs would send as many times as much.
+    if inner == "ipc" and is_even(layout) and layout.num_nodes == 1:
         # Not a sum of NCCL's: its order may differ from ring to ring.
-        return [inside, ReductionStage("all_gather", "ring", rings)]
+        return [inside, ReductionStage("all_gather", "ring", tuple(zip(*gpus, strict=True)))]
     between = ReductionStage("all_reduce", "ring", (leaders(layout),))
     return [inside, between, ReductionStage("broadcast", inner, led)]
 
 
 def _over_nodes(inside: Sequence[ReductionStage], nodes: Groups) -> Sequence[ReductionStage]:
-    """What one node does as done by all, and the sum over nodes."""
+    """What one node does as done by all, and the sum over nodes by TCP."""
     if len(nodes[0]) == 1:
         inside = []
     everywhere = [

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gmijax.config.actor_critic import ActorCriticConfig
+from gmijax.config.plan import PlanConfig
 from gmijax.config.schema import doc
 from gmijax.errors import ConfigError
 
@@ -14,7 +15,6 @@ from gmijax.errors import ConfigError
 class A3cConfig(ActorCriticConfig):
     """Hyper-parameters of asynchronous actor-critic training, with Brax's names."""
 
-    decoupled = "gmijax.a3c.decoupled:A3C"
     templates = ("decoupled",)
 
     # algo= sets it.
@@ -47,9 +47,9 @@ class A3cConfig(ActorCriticConfig):
         low=1,
     )
 
-    def check_job(self, num_envs: int | None, template: str) -> None:
+    def check_job(self, num_envs: int | None, plan: PlanConfig) -> None:
         """See `PolicyConfig`."""
-        del template
+        del plan
         if num_envs is not None:
             self.batch_of(num_envs)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, NamedTuple, Self
 
+from gmijax.config.plan import PlanConfig
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
 
@@ -49,11 +50,6 @@ class PolicyConfig(KeyGroup):
     implementation: ClassVar[str] = ""
     """`module:name` of the `gmijax.learning.algorithm.Algorithm`, where every GMI simulates, acts
     and trains; jax is imported with it."""
-    decoupled: ClassVar[str] = ""
-    """The same of the `gmijax.decoupled.algorithm.DecoupledAlgorithm`, where agents and trainers
-    are different GMIs."""
-    is_one_pair: ClassVar[bool] = False
-    """Whether there is only one of each then, on one GPU."""
     fixed_keys: ClassVar[tuple[str, ...]] = ("activation", "state_dependent_std")
     """What a resumed run cannot change, since its weights depend on it."""
     templates: ClassVar[tuple[Literal["tcg_ex", "tdg_ex", "decoupled"], ...]] = ("tcg_ex",)
@@ -157,13 +153,13 @@ class PolicyConfig(KeyGroup):
         del find
         return self
 
-    def check_job(self, num_envs: int | None, template: str) -> None:
+    def check_job(self, num_envs: int | None, plan: PlanConfig) -> None:
         """Checks what depends on other keys too; `num_envs` is None where it is not decided yet.
 
         Raises:
           ConfigError: environments per GMI do not divide into minibatches, or the like.
         """
-        del num_envs, template
+        del num_envs, plan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,9 +169,9 @@ class RolloutConfig(PolicyConfig):
     num_minibatches: int = doc("minibatches per pass over the rollout (a3c: a batch)", low=1)
     num_updates_per_batch: int = doc("passes over the rollout (a3c: a batch), epochs", low=1)
 
-    def check_job(self, num_envs: int | None, template: str) -> None:
+    def check_job(self, num_envs: int | None, plan: PlanConfig) -> None:
         """See `PolicyConfig`."""
-        del template
+        del plan
         samples = (num_envs or 0) * self.unroll_length
         if samples % self.num_minibatches:
             raise ConfigError(

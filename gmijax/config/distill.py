@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 from gmijax.config.algo import RolloutConfig
+from gmijax.config.plan import PlanConfig
 from gmijax.config.schema import doc
 from gmijax.errors import ConfigError
 
@@ -26,14 +27,14 @@ class DistillConfig(RolloutConfig):
         "with the same observations and actions; last: the newest run"
     )
 
-    def check_job(self, num_envs: int | None, template: str) -> None:
+    def check_job(self, num_envs: int | None, plan: PlanConfig) -> None:
         """See `PolicyConfig`."""
         if self.teacher is None:
             raise ConfigError(
                 "algo.teacher=null: algo=distill learns from a trained policy; expected its run "
                 "folder or checkpoint"
             )
-        super().check_job(num_envs, template)
+        super().check_job(num_envs, plan)
 
     def with_checkpoints(self, find: Callable[[str, str], Path]) -> Self:
         """See `PolicyConfig`."""

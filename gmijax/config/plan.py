@@ -77,9 +77,7 @@ class PlanConfig(KeyGroup):
         default=None,
     )
     serving_gmis_per_gpu: int | None = doc(
-        "with algo=a3c: acting GMIs on every GPU that acts, null: 1; with algo=sac: 1 to act in a "
-        "GMI of its own, null: agents and learner take turns in one program",
-        default=None,
+        "with algo=a3c: acting GMIs on every GPU that acts; null: 1", default=None
     )
     training_gmis_per_gpu: int = doc(
         "with algo=a3c: training GMIs on every GPU that trains", default=1
@@ -105,15 +103,8 @@ class PlanConfig(KeyGroup):
 
     @property
     def num_serving_gmis(self) -> int:
-        """Acting GMIs on every GPU that acts, where some do."""
+        """Acting GMIs on every GPU that acts."""
         return 1 if self.serving_gmis_per_gpu is None else self.serving_gmis_per_gpu
-
-    @property
-    def asks_for_agents(self) -> bool:
-        """Whether some GMIs shall act and others train, where an algorithm leaves the choice."""
-        given = self.serving_gmis_per_gpu, self.serving_gpus, self.training_gpus
-        is_asked = self.template == "decoupled" or any(value is not None for value in given)
-        return self.template in ("auto", "decoupled") and is_asked
 
     @property
     def num_gpus(self) -> int:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gmijax.config.actor_critic import ActorCriticConfig
+from gmijax.config.plan import PlanConfig
 from gmijax.config.schema import doc
 from gmijax.errors import ConfigError
 
@@ -51,11 +52,11 @@ class PpoConfig(ActorCriticConfig):
         """See `PolicyConfig`."""
         return self.warmup_unroll
 
-    def check_job(self, num_envs: int | None, template: str) -> None:
+    def check_job(self, num_envs: int | None, plan: PlanConfig) -> None:
         """See `PolicyConfig`."""
-        if self.recompute_advantages and template == "tdg_ex":
+        if self.recompute_advantages and plan.template == "tdg_ex":
             raise ConfigError(
                 "algo.recompute_advantages=true: for jobs in which every GMI trains; with "
                 "plan.template=tdg_ex allowed is false"
             )
-        super().check_job(num_envs, template)
+        super().check_job(num_envs, plan)

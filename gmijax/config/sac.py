@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gmijax.config.algo import KeptReplay, PolicyConfig
+from gmijax.config.plan import PlanConfig
 from gmijax.config.schema import doc
 from gmijax.errors import ConfigError
 
@@ -19,9 +20,6 @@ class SacConfig(PolicyConfig):
     """Hyper-parameters of SAC with many environments and large batches (arXiv:2512.01996)."""
 
     implementation = "gmijax.sac.sac:SAC"
-    decoupled = "gmijax.sac.decoupled:SAC"
-    is_one_pair = True
-    templates = ("tcg_ex", "decoupled")
     fixed_keys = (
         *PolicyConfig.fixed_keys,
         *("critic_hidden_layer_sizes", "num_atoms", "value_range"),
@@ -106,12 +104,16 @@ class SacConfig(PolicyConfig):
         """Steps of all environments after which the policy learns, in them or once after them."""
         return max(1, self.policy_every // self.updates_per_step)
 
-    def check_job(self, num_envs: int | None, template: str) -> None:
+    def check_job(self, num_envs: int | None, plan: PlanConfig) -> None:
         """See `PolicyConfig`."""
-        checks = (*self._sizes(num_envs), *self._policy())
-        if template == "decoupled":
-            checks = (*checks, *self._apart())
-        for key, is_wrong, allowed in checks:
+        for key in ("serving_gmis_per_gpu", "serving_gpus", "training_gpus"):
+            if (value := getattr(plan, key)) is not None:
+                shown = value if isinstance(value, int) else list(value)
+                raise ConfigError(
+                    f"plan.{key}={shown}: with algo=sac every GMI acts and trains; "
+                    f"write plan.{key}=null"
+                )
+        for key, is_wrong, allowed in (*self._sizes(num_envs), *self._policy()):
             if is_wrong:
                 value = getattr(self, key)
                 raise ConfigError(f"algo.{key}={value}: with algo=sac must be {allowed}")
@@ -142,16 +144,6 @@ class SacConfig(PolicyConfig):
             self.replay_precision != "float32" and not self.normalize_observations,
             "float32 where algo.normalize_observations=false",
         )
-
-    def _apart(self) -> Iterator[tuple[str, bool, str]]:
-        """The same where one GMI acts and another one learns."""
-        length = self.unroll_length
-        yield (
-            "replay_steps",
-            self.replay_steps % length > 0,
-            f"a multiple of algo.unroll_length={length} where a GMI of its own acts",
-        )
-        yield "save_replay", self.save_replay, "false where a GMI of its own acts"
 
     def _policy(self) -> Iterator[tuple[str, bool, str]]:
         """The same of the policy and of what it learns from."""

@@ -55,20 +55,14 @@ class TrainConfig(KeyGroup):
                 "time, and nobody evaluates; allowed is null (gmijax.play evaluates a checkpoint)"
             )
         num_envs = None if self.num_envs == "auto" else self.num_envs
-        template = "decoupled" if self.is_decoupled else self.plan.template
-        self.algo.check_job(num_envs, template)
-        if self.is_decoupled and self.algo.is_one_pair:
-            self._check_one_pair()
+        self.algo.check_job(num_envs, self.plan)
         if self.cluster.engine is not None:
             self._check_on_nodes()
 
     @property
     def is_decoupled(self) -> bool:
         """Whether some GMIs act and others train, each at its own pace."""
-        templates = self.algo.templates
-        if templates[0] == "decoupled":
-            return True
-        return "decoupled" in templates and self.plan.asks_for_agents
+        return self.algo.templates[0] == "decoupled"
 
     @property
     def envs_per_gmi(self) -> int:
@@ -76,16 +70,6 @@ class TrainConfig(KeyGroup):
         if self.num_envs == "auto":
             raise ConfigError("num_envs=auto: not decided yet; expected an integer")
         return self.num_envs
-
-    def _check_one_pair(self) -> None:
-        what = f"where algo={self.algo.name} acts in a GMI of its own"
-        if self.num_envs == "auto":
-            raise ConfigError(f"num_envs=auto: nothing is searched for {what}; give a number")
-        if self.cluster.engine is not None:
-            raise ConfigError(
-                f"cluster.engine={self.cluster.engine}: {what}, the job is on one machine; "
-                "allowed is null"
-            )
 
     def _check_on_nodes(self) -> None:
         if self.plan.template not in (allowed := ("auto", "tcg_ex", "decoupled")):

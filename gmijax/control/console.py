@@ -25,7 +25,7 @@ SMALL_TASK: Final = "ball_balance"
 """What two cores of a CPU learn within minutes; other tasks take hours there."""
 
 _DECISIONS = (
-    *("template ", "strategy ", "backend ", "intra ", "physics.impl ", "sm_percent "),
+    *("template ", "strategy ", "backend ", "intra ", "inter ", "physics.impl ", "sm_percent "),
     *("GPUs ", "nodes "),
 )
 """Beginnings of reasons of decisions. Other lines, such as warnings, are for everybody."""

@@ -10,7 +10,6 @@ from gmijax.config import EnvConfig, TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
 from gmijax.partition.plan import Plan
-from gmijax.partition.templates import TRAINER, has_role
 from gmijax.runs.folder import (
     RUNS,
     RunPaths,
@@ -108,8 +107,7 @@ def replay_line(config: TrainConfig, plan: Plan) -> tuple[str, ...]:
     if (replay := config.algo.kept_replay) is None:
         return ()
     own = replay.steps * config.envs_per_gmi
-    num_trainers = sum(has_role(role, TRAINER) for role in plan.roles)
-    each = "" if num_trainers == 1 else " in each GMI"
+    each = "" if plan.layout.num_gmis == 1 else " in each GMI"
     return (f"replay of {own:,} transitions{each} (MiB: replay/mib in the metrics)",)
 
 

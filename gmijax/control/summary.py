@@ -48,6 +48,7 @@ def train_summary(
             **plan_data(plan),
             "strategy": (result and result.strategy) or plan.strategy,
             "intra": (result and result.intra) or plan.intra,
+            "inter": (result and result.inter) or plan.inter,
         },
         "env_steps": env_steps,
         "wall_s": wall_s,

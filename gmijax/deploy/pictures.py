@@ -14,7 +14,13 @@ from gmijax.config import PlayConfig
 from gmijax.control.console import doing, nearby
 from gmijax.errors import GmijaxError
 from gmijax.machine.interpreter import command
-from gmijax.machine.opengl import environment_with, is_missing, opengls, what_is_missing
+from gmijax.machine.opengl import (
+    WITHOUT_OPENGL,
+    environment_with,
+    is_missing,
+    opengls,
+    what_is_missing,
+)
 from gmijax.runs.folder import EXIT_NO_GL, PlayPaths
 from gmijax.supervise.failures import last_line, signal_name
 from gmijax.viewer.installed import missing
@@ -25,7 +31,9 @@ def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     if missing():
         return
     with doing(console, "writing the page"), paths.page_log.open("wb") as log:
-        exit_code = run_child("gmijax.workers.page_writer", paths, os.environ, log)
+        exit_code = run_child(
+            "gmijax.workers.page_writer", paths, {**os.environ, **WITHOUT_OPENGL}, log
+        )
     if exit_code == 0:
         console.print(f"page: {nearby(paths.html)}")
         return

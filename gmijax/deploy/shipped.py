@@ -5,6 +5,7 @@ A child does it, `gmijax.workers.plain_playback`. No jax and no mujoco here.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Final
 
@@ -12,7 +13,7 @@ from gmijax.config import PlayConfig
 from gmijax.config.schema import to_dict
 from gmijax.deploy.pictures import run_child
 from gmijax.errors import ConfigError, GmijaxError
-from gmijax.machine.opengl import environment_with
+from gmijax.machine.opengl import WITHOUT_OPENGL
 from gmijax.player.shipped import require_shipped
 from gmijax.runs.folder import RUNS, PlayPaths, RunPaths, remove_temporary, write_json
 from gmijax.supervise.failures import last_line
@@ -69,8 +70,7 @@ def play(paths: PlayPaths, seconds: float | None = None) -> None:
     own = () if seconds is None else (str(seconds),)
     log = paths.root / "stderr.log"
     with log.open("wb") as output:
-        # It draws nothing, so no OpenGL need be there.
-        environment = environment_with("disable")
+        environment = {**os.environ, **WITHOUT_OPENGL}
         code = run_child("gmijax.workers.plain_playback", paths, environment, output, *own)
     if code == 2:
         raise ConfigError(last_line(log))

@@ -50,7 +50,8 @@ class TrainingLoop:
       link: to the controller.
       remote: how many other GMIs simulate for this one, which then has no environments.
       times: seconds of other parts of the last iteration, by the names that they are logged under.
-      exchange: `strategy` and `intra` that are used, where they may differ from the plan's.
+      exchange: `strategy`, `intra` and `inter` that are used, where they may differ from the
+        plan's.
     """
 
     def __init__(
@@ -318,6 +319,7 @@ class TrainingLoop:
             profile=self._trace.outcome(),
             strategy=self._exchange.get("strategy"),
             intra=self._exchange.get("intra"),
+            inter=self._exchange.get("inter"),
         )
 
     def _write(self, run: RunPaths, result: TrainResult) -> None:

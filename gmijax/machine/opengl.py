@@ -17,6 +17,9 @@ from gmijax.machine.interpreter import command
 from gmijax.runs.folder import EXIT_NO_GL
 
 _GL: Final = "MUJOCO_GL"
+WITHOUT_OPENGL: Final = {_GL: "disable"}
+"""For processes that draw nothing: where MUJOCO_GL names what is not installed, importing mujoco
+fails."""
 
 
 def opengls(*others: str) -> tuple[str, ...]:

@@ -52,6 +52,7 @@ class Plan:
       num_envs_per_gmi: N.
       strategy: gradient reduction, `none` for one GMI.
       intra: exchange inside one GPU.
+      inter: exchange between nodes, `nccl` or `tcp`; None where those that train are on one.
       roles: what every GMI does, in order of id (see `gmijax.partition.templates`); none where
         that is classes of the user's own.
       reasons: what was decided for an `auto`, and why, one sentence each.
@@ -76,6 +77,7 @@ class Plan:
     self_check: bool = False
     allow_fallback: bool = False
     nodes: tuple[str, ...] = ()
+    inter: str | None = None
 
     def __post_init__(self) -> None:
         if self.layout.num_nodes != max(1, len(self.nodes)):

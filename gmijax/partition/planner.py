@@ -25,6 +25,7 @@ from gmijax.partition.reduction import (
     require_strategy,
     select_strategy,
     why_not_intra,
+    why_not_nccl,
     why_not_strategy,
     why_not_under,
 )
@@ -71,7 +72,8 @@ def make_plan(
     allocations, gpus = _allocations(plan, of_nodes, backend, reasons)
     if plan.template == "auto":
         reasons.append(f"template {chosen}: {DESCRIPTIONS[chosen]}")
-    strategy, intra = _reduction(reduce, layout, roles, backend, reasons)
+    devices = [allocation.device for allocation in allocations]
+    strategy, intra, inter = _reduction(reduce, layout, roles, backend, devices, reasons)
     return Plan(
         layout=layout,
         allocations=allocations,
@@ -85,6 +87,7 @@ def make_plan(
         self_check=_self_check(plan, allocations, backend, of_nodes),
         allow_fallback=_allow_fallback(plan, gpus, backend),
         nodes=tuple(nodes or ()),
+        inter=inter,
     )
 
 
@@ -196,12 +199,13 @@ def _reduction(
     layout: Layout,
     roles: tuple[str, ...],
     backend: BackendName,
+    devices: Sequence[str],
     reasons: list[str],
-) -> tuple[str, str]:
-    """How those that train average gradients, and how they exchange inside one GPU."""
+) -> tuple[str, str, str | None]:
+    """How those that train average gradients, and exchange inside one GPU and between nodes."""
     training = group_of(layout, roles, TRAINER)
     if training is None:
-        return "none", "host"
+        return "none", "host", None
     of_ranks = [training.layout.node_of(rank) for rank in range(len(training.gmis))]
     nodes = nodes_of(layout, training.gmis)
     is_split = [nodes[node] for node in of_ranks] == [layout.node_of(g) for g in training.gmis]
@@ -210,12 +214,18 @@ def _reduction(
             f"plan.training_gpus: of layout {layout} GMIs {list(training.gmis)} train, and nodes "
             "that train must have as many of them on as many GPUs, numbered in order of the nodes"
         )
-    strategy = _strategy(reduce, training.layout, backend, reasons)
-    return strategy, _intra(strategy, backend, reasons)
+    no_nccl = why_not_nccl(training.layout, backend, [devices[gmi] for gmi in training.gmis])
+    strategy = _strategy(reduce, training.layout, backend, no_nccl, reasons)
+    inter = _inter(strategy, training.layout, no_nccl, reasons)
+    return strategy, _intra(strategy, backend, reasons), inter
 
 
 def _strategy(
-    reduce: ReduceConfig, layout: Layout, backend: BackendName, reasons: list[str]
+    reduce: ReduceConfig,
+    layout: Layout,
+    backend: BackendName,
+    no_nccl: str | None,
+    reasons: list[str],
 ) -> str:
     """How those that train, in `layout`, average gradients; `none` if there is only one."""
     is_named = reduce.strategy not in ("auto", "paper")
@@ -226,6 +236,10 @@ def _strategy(
         return "none"
     if is_named:
         return reduce.strategy
+    is_one_ring = layout.num_nodes > 1 and layout.num_gmis == layout.num_gpus
+    if is_one_ring and no_nccl is None and reduce.strategy == "auto":
+        reasons.append("strategy flat: one GMI on each GPU of several nodes, so one ring of all")
+        return "flat"
     paper, why = select_strategy(layout)
     no_ring = why_not_under(paper, layout, backend)
     if backend == "cpu" and needs_ring(paper, layout):
@@ -249,6 +263,18 @@ def _strategy(
         return "mpr"
     reasons.append(f"strategy {paper}: {why} (Algorithm 1){slow}")
     return paper
+
+
+def _inter(strategy: str, layout: Layout, no_nccl: str | None, reasons: list[str]) -> str | None:
+    if layout.num_nodes == 1:
+        return None
+    if strategy == "mpr":
+        no_nccl = no_nccl or "mpr goes through the host"
+    if no_nccl is not None:
+        reasons.append(f"inter tcp: nodes exchange through the host and TCP; {no_nccl}")
+        return "tcp"
+    reasons.append("inter nccl: rings of NCCL go from GPUs of one node to those of others")
+    return "nccl"
 
 
 def _intra(strategy: str, backend: BackendName, reasons: list[str]) -> str:

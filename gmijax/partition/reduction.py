@@ -7,7 +7,7 @@ The controller checks a plan with them before it starts anything, and
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -63,8 +63,8 @@ def select_strategy(layout: Layout) -> Choice:
 
 def why_not_strategy(strategy: str, layout: Layout) -> str | None:
     """None if `strategy` can run on `layout`, else the reason in words."""
-    if layout.num_nodes == 1 or strategy == "none":
-        return STRATEGIES[strategy].why_not(layout)
+    if layout.num_nodes == 1 or strategy in ("none", "flat"):
+        return STRATEGIES[strategy].why_not(layout)  # One ring may go over all nodes.
     # It is what each node does inside; whatever that is, their leaders exchange.
     reason = STRATEGIES[strategy].why_not(layout.of_node(0))
     return reason and f"in each node {reason}"
@@ -105,9 +105,7 @@ def why_not_under(strategy: str, layout: Layout, backend: str) -> str | None:
             "rings between MIG instances are not supported, because NCCL takes one of each GPU; "
             "with plan.backend=mig allowed are auto, mpr"
         )
-    if not is_installed("nccl", "nccl.bindings"):
-        return f"rings between GPUs need the package nccl4py {_INSTALL}"
-    return None
+    return why_no_nccl()
 
 
 def why_no_bindings() -> str | None:
@@ -126,8 +124,31 @@ def why_no_bindings() -> str | None:
     )
 
 
+def why_not_nccl(layout: Layout, backend: str, devices: Sequence[str]) -> str | None:
+    """None if nodes can exchange by NCCL, else the reason.
+
+    Args:
+      layout: of the GMIs that train.
+      backend: of all nodes.
+      devices: what each of them sees, by rank: UUIDs of GPUs.
+    """
+    if backend in ("cpu", "mig"):
+        return f"NCCL needs whole GPUs, and the backend is {backend}"
+    homes = {(device, layout.node_of(rank)) for rank, device in enumerate(devices)}
+    if len(homes) > len(set(devices)):
+        return "nodes of one machine have the same GPU, and NCCL takes one process of each"
+    return why_no_nccl() or why_no_bindings()
+
+
+def why_no_nccl() -> str | None:
+    """None if GPUs can form rings, else the reason."""
+    if is_installed("nccl", "nccl.bindings"):
+        return None
+    return f"rings between GPUs need the package nccl4py {_INSTALL}"
+
+
 def needs_ring(strategy: str, layout: Layout) -> bool:
-    """Whether GMIs form rings between GPUs, which are in every node by itself."""
+    """Whether GMIs form rings between the GPUs of a node."""
     return STRATEGIES[strategy].has_ring(layout.of_node(0))
 
 

@@ -31,8 +31,8 @@ class TrainResult:
       profile: see `IterationTrace.outcome`; None where nothing was asked for.
       step_per_s_sim, step_per_s_inference: rates without learning, and without a policy; None
         where they were not measured.
-      pps, ttop, staleness, bytes_per_s: see `gmijax.decoupled.report`; of asynchronous training.
-      strategy, intra: the exchange that was used, where it may differ from the plan's.
+      pps, ttop, staleness, bytes_per_s: see `gmijax.a3c.report`; of asynchronous training.
+      strategy, intra, inter: the exchange that was used, where it may differ from the plan's.
     """
 
     status: str
@@ -56,6 +56,7 @@ class TrainResult:
     bytes_per_s: float | None = None
     strategy: str | None = None
     intra: str | None = None
+    inter: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The content of `result.json`; what may be missing and is None is left out."""

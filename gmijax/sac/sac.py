@@ -4,16 +4,14 @@ The policy learns once after every `policy_every` updates of the critics: severa
 or once after several rounds. Which is known when the program is made, so that no gradient is
 computed that is not used, also where several runs share a program.
 
-Agents and learner take turns in one program; in `gmijax.sac.decoupled` they are GMIs of their own.
-Where several GMIs train, each has its own environments and its own replay, and they average the
-gradients of their batches.
+Agents and learner take turns in one program. Where several GMIs train, each has its own
+environments and its own replay, and they average the gradients of their batches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +19,7 @@ import jax.numpy as jnp
 from gmijax.collectives.interface import Collectives
 from gmijax.learning.algorithm import Algorithm, IterationMetrics
 from gmijax.learning.learner import acting_weights, finish_iteration, make_learner, policy_figures
-from gmijax.learning.normalize import Moments, moments_of, without_outliers
+from gmijax.learning.normalize import moments_of, without_outliers
 from gmijax.learning.unroll import RolloutSums, act, count, merge_sums, outcome_of, unroll
 from gmijax.sac.losses import CriticFigures
 from gmijax.sac.replay import Replay, can_learn, insert, kind_of, size_bytes
@@ -29,9 +27,6 @@ from gmijax.sac.state import Memory, SacLearner, SacState, begin, init, num_aver
 from gmijax.sac.updates import UpdateFigures, losses_of, update_critics, update_policy
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
 from gmijax.types import Array, PRNGKey, PyTree
-
-Advance: TypeAlias = Callable[[SacState, Any], tuple[Any, Any]]
-"""`(state, memory) -> (memory, what is known of it)`: what comes before the updates of a round."""
 
 
 def iterate(
@@ -43,56 +38,39 @@ def iterate(
     memory: Memory,
 ) -> tuple[SacState, Memory, IterationMetrics]:
     """See `gmijax.learning.algorithm.Iterate`: T rounds of a step and its updates."""
-    advance = partial(step_into_replay, env, learner, model)
-    state, memory, (stats, losses) = rounds(learner, collectives, advance, state, memory)
-    stats = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), stats)
-    everyone = collectives.all_gather(merge_sums(stats), after=losses)
-    seen, counts = merge_sums(everyone)
-    state = finish_iteration(learner, state, seen)
-    figures = policy_figures(state) | figures_of(state, memory.replay)
-    return state, memory, IterationMetrics(counts, losses_of(losses), figures, {})
-
-
-def figures_of(state: SacState, replay: Replay) -> dict[str, Array]:
-    """Figures beside those of the policy, by the names that they are logged under."""
-    return {
-        "policy/temperature": jnp.exp(state.log_temperature),
-        "replay/steps": replay.filled.astype(jnp.float32),
-        "replay/clipped": replay.num_clipped,
-        "replay/mib": jnp.asarray(size_bytes(replay) / 2**20, jnp.float32),
-    }
-
-
-def rounds(
-    learner: SacLearner, collectives: Collectives, advance: Advance, state: SacState, memory: Any
-) -> tuple[SacState, Any, tuple[Any, UpdateFigures]]:
-    """The updates of an iteration, of T rounds; `memory` has the replay as `replay`.
-
-    Returns:
-      State and memory; what `advance` said of each round, and the figures of its updates, with
-      leading axes [turns of the policy, rounds in one].
-    """
     config = learner.config
     key = jax.random.fold_in(jax.random.fold_in(state.key, state.iteration), collectives.rank())
     length = config.rounds_per_turn
     keys = jax.random.split(key, (config.unroll_length // length, length + 1))
-    turn = partial(_turn, learner, collectives, advance)
-    (state, memory), results = jax.lax.scan(turn, (state, memory), keys)
-    return state, memory, results
+    turn = partial(_turn, env, learner, collectives, model)
+    (state, memory), (stats, losses) = jax.lax.scan(turn, (state, memory), keys)
+    stats = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), stats)
+    everyone = collectives.all_gather(merge_sums(stats), after=losses)
+    seen, counts = merge_sums(everyone)
+    state = finish_iteration(learner, state, seen)
+    figures = {
+        **policy_figures(state),
+        "policy/temperature": jnp.exp(state.log_temperature),
+        "replay/steps": memory.replay.filled.astype(jnp.float32),
+        "replay/clipped": memory.replay.num_clipped,
+        "replay/mib": jnp.asarray(size_bytes(memory.replay) / 2**20, jnp.float32),
+    }
+    return state, memory, IterationMetrics(counts, losses_of(losses), figures, {})
 
 
 def _turn(
+    env: BatchedEnv,
     learner: SacLearner,
     collectives: Collectives,
-    advance: Advance,
-    before: tuple[SacState, Any],
+    model: PyTree,
+    before: tuple[SacState, Memory],
     keys: PRNGKey,
-) -> tuple[tuple[SacState, Any], tuple[Any, UpdateFigures]]:
+) -> tuple[tuple[SacState, Memory], tuple[RolloutSums, UpdateFigures]]:
     """As many rounds as an update of the policy is made after; `keys` [rounds + 1]."""
 
-    def one_round(before: tuple[SacState, Any], key: PRNGKey) -> Any:
+    def one_round(before: tuple[SacState, Memory], key: PRNGKey) -> Any:
         state, memory = before
-        memory, stats = advance(state, memory)
+        memory, stats = step_into_replay(env, learner, model, state, memory)
         state, figures = learn_in_round(learner, collectives, memory.replay, state, key)
         return (state, memory), (stats, figures)
 
@@ -162,22 +140,13 @@ def step_into_replay(
         model,
         memory.envs,
     )
-    replay, seen = take_in(memory.replay, weights.moments, obs, action, reward, kind)
-    return Memory(envs, replay), RolloutSums(seen, count(reward, outcomes))
-
-
-def take_in(
-    replay: Replay, known: Moments, obs: Array, action: Array, reward: Array, kind: Array
-) -> tuple[Replay, Moments]:
-    """The replay with T more rows, and the statistics of their observations; see `insert`.
-
-    `known` are those before. Each observation counts once, when it is made: batches show the same
-    ones again and again.
-    """
-    seen = moments_of(without_outliers(known, obs), 2)
+    # Each observation counts once, when it is made: batches show the same ones again and again.
+    seen = moments_of(without_outliers(weights.moments, obs), 2)
+    known = weights.moments
     # The first iteration has its own statistics alone.
     units = jax.tree.map(partial(jnp.where, known.count > 0), known, seen)
-    return insert(replay, units, obs, action, reward, kind), seen
+    replay = insert(memory.replay, units, obs, action, reward, kind)
+    return Memory(envs, replay), RolloutSums(seen, count(reward, outcomes))
 
 
 SAC = Algorithm(

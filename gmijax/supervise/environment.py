@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from gmijax.machine.jax_settings import without_breaking
+from gmijax.machine.opengl import WITHOUT_OPENGL
 from gmijax.machine.xla_on_cpu import POOL, XLA_FLAGS, flags_on_cpu, pool_on_cpu
 from gmijax.partition.plan import Allocation, Plan
 from gmijax.supervise.child import ENV_CPUS, ENV_GMI
@@ -20,6 +21,9 @@ _MEMORY_FRACTION, _OLD_MEMORY_FRACTION = (
     "XLA_PYTHON_CLIENT_MEM_FRACTION",
 )
 _SM_PERCENT = "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE"
+NCCL_INTERFACE: Final = "NCCL_SOCKET_IFNAME"
+"""Where NCCL listens and connects; not what InfiniBand and the like send by."""
+
 COMPILATION_CACHE: Final = "JAX_COMPILATION_CACHE_DIR"
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -56,8 +60,9 @@ def gmi_environment(
         own = _cpu(allocation, inherited.get(XLA_FLAGS, ""))
     else:
         own = _gpu(allocation)
-        # All GMIs are on this host, and NCCL's sockets are open to whoever reaches them.
-        defaults["NCCL_SOCKET_IFNAME"] = "lo"
+        if plan.layout.num_nodes == 1:
+            # All GMIs are on this host, and NCCL's sockets are open to whoever reaches them.
+            defaults[NCCL_INTERFACE] = "lo"
     return {**defaults, **kept, **own, **_common(allocation), **backend_environment}
 
 
@@ -70,6 +75,7 @@ def _common(allocation: Allocation) -> dict[str, str]:
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         # NVLink multicast is unsafe on hosts that are shared with others.
         "NCCL_NVLS_ENABLE": "0",
+        **WITHOUT_OPENGL,
     }
 
 

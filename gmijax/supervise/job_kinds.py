@@ -19,7 +19,7 @@ from gmijax.channels.registers import create_registers
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
-from gmijax.partition.placement import Placement, num_gmis_of, on_fewer_nodes, place
+from gmijax.partition.placement import num_gmis_of, on_fewer_nodes, place
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan, require_host
 from gmijax.partition.reduction import why_not_intra
@@ -120,8 +120,6 @@ def training_plan(
         num_nodes = len(nodes)
         wishes = on_fewer_nodes(wishes, config.cluster.nodes, num_nodes)
     placed = place(wishes, num_nodes)
-    if config.algo.is_one_pair:
-        _require_one_pair(config, placed)
     plan = make_plan(
         placed.plan,
         config.reduce,
@@ -141,22 +139,6 @@ def training_plan(
     could_stay = why_not is None and channel.why_not_device() is None
     advice = (_ADVICE,) if could_stay and channel.transport == "memory" else ()
     return dataclasses.replace(plan, reasons=(placed.reason, *plan.reasons, *advice))
-
-
-def _require_one_pair(config: TrainConfig, placed: Placement) -> None:
-    """Refuses a placement with more than one agent and one trainer, or on two GPUs."""
-    plan, layout = config.plan, placed.plan.layout
-    assert layout is not None
-    for key, number in (
-        ("plan.gpus", len(layout)),
-        ("plan.serving_gmis_per_gpu", plan.num_serving_gmis),
-        ("plan.training_gmis_per_gpu", plan.training_gmis_per_gpu),
-    ):
-        if number != 1:
-            raise ConfigError(
-                f"{key}={number}: where algo={config.algo.name} acts in a GMI of its own, one GMI "
-                "acts and one trains, both on one GPU; allowed is 1"
-            )
 
 
 def _require_experience_for_all(topology: ChannelTopology) -> None:

@@ -78,8 +78,7 @@ def why_alone(job: Job) -> str | None:
     config = job.config
     plan = config.plan
     for found, why in (
-        (config.algo.templates[0] == "decoupled", f"algo={config.algo.name}"),
-        (config.is_decoupled, "a GMI that only acts"),
+        (config.is_decoupled, f"algo={config.algo.name}"),
         (config.num_envs == "auto", "num_envs=auto"),
         (plan.gpus != 1, f"plan.gpus={plan.gpus}"),
         (plan.gmis_per_gpu != 1, f"plan.gmis_per_gpu={plan.gmis_per_gpu}"),

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 
+from gmijax.a3c.job_registers import JobRegisters, register_bytes
 from gmijax.channels.registers import RemoteRegisters
 from gmijax.collectives.nodes.rendezvous import NodeAddresses
-from gmijax.decoupled.job_registers import JobRegisters, register_bytes
 
 
 def over_nodes(

@@ -153,13 +153,14 @@ def _run_asynchronous(
     link: ChildLink,
     held: ExitStack,
 ) -> dict[str, Any]:
+    from gmijax.a3c.a3c import A3cLosses
+    from gmijax.a3c.agent import Agent
+    from gmijax.a3c.job_registers import open_job_registers
+    from gmijax.a3c.rollout import num_counts
+    from gmijax.a3c.trainer import Trainer
     from gmijax.channels.build import open_receiver, open_sender
-    from gmijax.decoupled.agent import Agent
-    from gmijax.decoupled.algorithm import load_decoupled
-    from gmijax.decoupled.job_registers import open_job_registers
-    from gmijax.decoupled.trainer import Trainer
-    from gmijax.decoupled.unrolls import num_counts
     from gmijax.learning.learner import num_weights
+    from gmijax.learning.updates import exchange_size
     from gmijax.workers.node_registers import over_nodes
 
     agents, trainers = groups_of(plan)
@@ -179,7 +180,7 @@ def _run_asynchronous(
         return Agent(config, env, place, trainers.gmis, registers, sender, link).run()
     receiver = open_receiver(*channels)
     held.callback(receiver.close)
-    num_averaged = load_decoupled(config.algo).num_averaged(env.spec, config.algo)
+    num_averaged = exchange_size(env.spec, config.algo, A3cLosses)
     comm = _trainers_communicator(config, plan, trainers, link, num_averaged, nodes, listener)
     if listener is not None:
         listener.close()  # Trainers that are all on one node do not meet others.
@@ -236,6 +237,7 @@ def _trainers_communicator(
         timeout_s=config.reduce.timeout_s,
         rendezvous_timeout_s=config.run.start_timeout_s,
         intra=plan.intra,
+        inter=plan.inter,
         # Whoever asks for it by name is told that it does not work.
         host_if_unavailable=config.reduce.strategy != "one_shot",
         nodes=nodes,
@@ -246,9 +248,10 @@ def _trainers_communicator(
 
 def exchange_used(plan: Plan, comm: Communicator) -> dict[str, str]:
     """For the summary: the exchange in use, where it may differ from the plan's strategy."""
+    used = {} if comm.inter is None else {"inter": comm.inter}
     if comm.strategy != plan.strategy:
-        return {"strategy": comm.strategy, "intra": "host"}
-    return {"intra": comm.intra} if plan.strategy == "har" else {}
+        return {"strategy": comm.strategy, "intra": "host", **used}
+    return {"intra": comm.intra, **used} if plan.strategy == "har" else used
 
 
 def _neighbours(plan: Plan, gmi: int, role: str) -> tuple[int, ...]:

@@ -8,7 +8,14 @@ from pathlib import Path
 import pytest
 
 from gmijax.collectives.strategies import COSTS
-from tests.communicator_contract import PAIRS, Case, check_contract
+from tests.communicator_contract import (
+    PAIRS,
+    RINGS_OVER_NODES,
+    Case,
+    RingsOverNodes,
+    check_contract,
+    check_rings_over_nodes,
+)
 from tests.rank_processes import Ranks
 
 pytestmark = pytest.mark.timeout(200)
@@ -91,6 +98,44 @@ def test_device_memory_that_one_node_lacks_is_used_by_none(tmp_path: Path) -> No
         assert result["error"] is None, result
         said = "what was written into it; so reduce.strategy=mpr through host memory"
         assert said in (tmp_path / f"stderr_{rank}").read_text()
+
+
+@pytest.mark.parametrize("case", RINGS_OVER_NODES, ids=str)
+def test_nodes_exchange_in_rings_and_see_the_end_of_another(
+    case: RingsOverNodes, tmp_path: Path
+) -> None:
+    """NCCL has a stand-in here; like it, that one waits for ever for who is gone."""
+    check_rings_over_nodes(case, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("special", "ways"),
+    [
+        ("without_network", ["ncclSystemError; so nodes exchange by TCP"]),
+        (
+            "forgetful",
+            ["so nodes exchange by TCP", "so reduce.strategy=mpr through host memory"],
+        ),
+    ],
+)
+def test_what_one_rank_lacks_for_rings_over_nodes_is_used_by_none(
+    special: str, ways: list[str], tmp_path: Path
+) -> None:
+    options = {"strategy": "one_shot", "intra": "ipc", "num_calls": 2, "layout": [[0, 1], [2, 3]]}
+    # All members of a ring fail alike.
+    ranks = {"special_rank": 3} if special == "forgetful" else {"special_rank": 0}
+    options |= {"inter": "nccl", "special": special, "host_if_unavailable": True, **ranks}
+    with Ranks(tmp_path, 4, "check_means", num_nodes=2, **options).start(
+        *((0, 1, 3) if special == "without_network" else ())
+    ) as job:
+        if special == "without_network":
+            job.start(2, special_rank=2)
+        results = job.results()
+    assert len({result["digest"] for result in results}) == 1
+    for rank, result in enumerate(results):
+        assert result["error"] is None, result
+        said = (tmp_path / f"stderr_{rank}").read_text()
+        assert all(way in said for way in ways), said
 
 
 def test_a_device_that_takes_no_copies_leaves_exchanges_to_the_host(tmp_path: Path) -> None:

@@ -17,8 +17,15 @@ from training_jobs import POINT_TASK, STEPS, TINY, learner_arrays, train
 
 from gmijax.machine.nvidia import list_gpus
 from gmijax.partition.layout import Layout
-from gmijax.partition.reduction import why_not_intra
-from tests.communicator_contract import PAIRS, Case, check_contract
+from gmijax.partition.reduction import why_no_nccl, why_not_intra
+from tests.communicator_contract import (
+    PAIRS,
+    RINGS_OVER_NODES,
+    Case,
+    RingsOverNodes,
+    check_contract,
+    check_rings_over_nodes,
+)
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(200)]
 
@@ -64,6 +71,21 @@ def _require(intra: str) -> None:
 def test_the_contract(strategy: str, intra: str, case: Case, tmp_path: Path) -> None:
     _require(intra)
     check_contract(strategy, intra, case, tmp_path, _gpus(case.layout.num_gpus))
+
+
+@pytest.mark.parametrize("sockets", [False, True])
+@pytest.mark.parametrize("case", RINGS_OVER_NODES, ids=str)
+def test_nodes_exchange_in_rings_and_see_the_end_of_another(
+    case: RingsOverNodes, sockets: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The GPUs of two nodes, which are this machine: over NVLink or PCIe, and over sockets."""
+    _require("ipc")
+    if reason := why_no_nccl():
+        pytest.skip(reason)
+    if sockets:
+        for name in ("NCCL_P2P_DISABLE", "NCCL_SHM_DISABLE", "NCCL_IB_DISABLE"):
+            monkeypatch.setenv(name, "1")
+    check_rings_over_nodes(case, tmp_path, _gpus(2))
 
 
 @pytest.mark.timeout(400)

@@ -28,19 +28,3 @@ def test_networks_as_large_as_they_are_used_learn(updates: int, tmp_path: Path) 
     assert len(lines) == 20
     assert all(math.isfinite(line["loss/critic_loss"]) for line in lines)
     assert lines[-1]["loss/critic_loss"] > 0
-
-
-@pytest.mark.parametrize("transport", ["memory", "device"])
-def test_an_agent_and_a_learner_share_a_gpu(transport: str, tmp_path: Path) -> None:
-    done = train(
-        *("env=ball_balance", "physics.impl=jax", "algo=sac", "num_envs=1024"),
-        *("plan.serving_gmis_per_gpu=1", "plan.backend=mps", f"channel.transport={transport}"),
-        *(f"num_timesteps={40 * 16 * 1024}", "run.dir=run"),
-        cwd=tmp_path,
-        timeout_s=580.0,
-    )
-    assert done.returncode == 0, done.stderr
-    lines = read_metrics(tmp_path / "run" / "metrics.jsonl")
-    assert lines[-1]["async/updates_per_step"] == 2
-    assert all(math.isfinite(line["loss/critic_loss"]) for line in lines)
-    assert sum(line["diverged_steps"] for line in lines) == 0

@@ -31,7 +31,7 @@ from training_jobs import (
     wait_until,
 )
 
-from gmijax.decoupled.report import MAX_COUNTED
+from gmijax.a3c.report import MAX_COUNTED
 from gmijax.learning.episode_window import WINDOW_EPISODES
 from gmijax.runs.history import read_metrics
 from gmijax.runs.resume import find_checkpoint

@@ -47,12 +47,14 @@ SAME = ("algo.num_minibatches=1", "algo.num_updates_per_batch=3", f"num_timestep
 
 @pytest.fixture(scope="module")
 def two_gmis(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six iterations of two GMIs, of which two are traced."""
+    """Six iterations of two GMIs, of which two are traced; MUJOCO_GL names what is not there."""
     cwd = tmp_path_factory.mktemp("two")
-    done = train(
-        *POINT, *SAME, "plan.gmis_per_gpu=2", "run.dir=run", "run.profile=2:3",
-        "run.measure_throughput=true", "run.checkpoint_every=3", "-v", cwd=cwd,
-    )  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MUJOCO_GL", "missing")
+        done = train(
+            *POINT, *SAME, "plan.gmis_per_gpu=2", "run.dir=run", "run.profile=2:3",
+            "run.measure_throughput=true", "run.checkpoint_every=3", "-v", cwd=cwd,
+        )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "strategy mpr" in done.stdout
     assert re.search(PROFILED, done.stdout)

@@ -12,16 +12,11 @@ import numpy as np
 from toy_env import point_mass
 from training_jobs import wait_until
 
+from gmijax.a3c.agent import Agent
+from gmijax.a3c.job_registers import AgentCommand, AgentReport, JobRegisters, open_job_registers
+from gmijax.a3c.rollout import num_counts
 from gmijax.channels.registers import create_registers
 from gmijax.cli.compose import compose
-from gmijax.decoupled.agent import Agent
-from gmijax.decoupled.job_registers import (
-    AgentCommand,
-    AgentReport,
-    JobRegisters,
-    open_job_registers,
-)
-from gmijax.decoupled.unrolls import num_counts
 from gmijax.learning.learner import (
     acting_weights,
     init_learner,

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gmijax.a3c.fresh_batches import FreshBatches
 from gmijax.channels.experience import Rollouts, Spec
 from gmijax.cli.compose import compose
 from gmijax.collectives.communicator import SingleRankCommunicator
-from gmijax.decoupled.algorithm import load_decoupled
-from gmijax.decoupled.fresh_batches import FreshBatches
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink
 
@@ -46,10 +45,9 @@ def _batches(
     tmp_path: Path, *versions: list[int], comm: SingleRankCommunicator | None = None
 ) -> FreshBatches:
     config = compose("env=ball_balance", "algo=a3c", "num_envs=4", "algo.max_staleness=3")
-    flow = load_decoupled(config.algo).flow(config.algo, config.envs_per_gmi)
     link = ChildLink(0, RunPaths(tmp_path), None, None)
     arrivals = _Arrivals(*versions)
-    return FreshBatches(config, flow, arrivals, comm or SingleRankCommunicator(), link)
+    return FreshBatches(config, arrivals, comm or SingleRankCommunicator(), link)
 
 
 def test_unrolls_of_batches_that_are_passed_over_count_as_stale(tmp_path: Path) -> None:

@@ -14,12 +14,11 @@ from axis_collectives import run_together
 from toy_env import point_mass
 
 from gmijax.a3c.a3c import A3cLosses, gradients, update
-from gmijax.a3c.rollout import collect, join
+from gmijax.a3c.report import histogram_of, mean_and_p99
+from gmijax.a3c.rollout import UnrollPrograms, collect
 from gmijax.a3c.targets import Unrolls, batch_targets
 from gmijax.cli.compose import compose
 from gmijax.collectives.program import LocalCollectives
-from gmijax.decoupled.report import histogram_of, mean_and_p99
-from gmijax.decoupled.unrolls import UnrollPrograms
 from gmijax.learning.learner import (
     acting_weights,
     init_learner,
@@ -131,8 +130,7 @@ def test_pieces_make_the_unroll_that_they_are_parts_of(start) -> None:
     learner, state, envs = start
     weights = acting_weights(learner, state)
     _, whole, counts = _unrolled(*start)
-    piece = partial(collect, ENV, learner.networks, T // 4)
-    programs = UnrollPrograms(ENV, piece, join, 4, weights, envs)
+    programs = UnrollPrograms(ENV, learner.networks, T // 4, 4, weights, envs)
     envs, pieces = _copy(envs), []
     for _ in range(4):
         envs, piece = programs.piece(weights, envs)
@@ -222,9 +220,8 @@ def test_two_trainers_stay_equal_and_weigh_fresh_unrolls_alike(config) -> None:
     only_fresh = jax.tree.map(lambda x: x[:, fresh > 0], both)
     _, theirs = jax.device_get(learn(state, only_fresh, np.ones(N + 1, np.float32)))
     np.testing.assert_allclose(losses, theirs.losses, rtol=1e-4, atol=1e-6)
-    name = "value/explained_variance"
-    for one in (said.figures[name], told.figures[name][0]):
-        np.testing.assert_allclose(one, theirs.figures[name], rtol=1e-3, atol=1e-4)
+    for one in (said.explained_variance, told.explained_variance[0]):
+        np.testing.assert_allclose(one, theirs.explained_variance, rtol=1e-3, atol=1e-4)
 
 
 def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(start, batch) -> None:

@@ -19,8 +19,7 @@ def test_an_efficiency_is_that_of_the_formulas_by_hand():
     between_s = 2 * 3 * num_bytes / (4 * 100e9 / 8)
     messages_s = 2 * 3 * 20e-6
     exchanges_s = 17 * 10 * (inside_s + between_s + messages_s)
-    network = scaling.Network(100, 20)
-    assert scaling.efficiency(KNOWN, "ant", "mpr", 4, network, 10) == pytest.approx(
+    assert scaling.efficiency(KNOWN, "ant", "mpr", 4, 100, 20, 10) == pytest.approx(
         0.07 / (0.07 + exchanges_s)
     )
 
@@ -28,19 +27,19 @@ def test_an_efficiency_is_that_of_the_formulas_by_hand():
 @pytest.mark.parametrize("task", scaling.TRAININGS)
 def test_more_nodes_slower_networks_and_longer_messages_cost(task: str):
     def at(nodes: int, gbit: float = 100, us: float = 50, times: float = 1) -> float:
-        return scaling.efficiency(KNOWN, task, "flat", nodes, scaling.Network(gbit, us), times)
+        return scaling.efficiency(KNOWN, task, "flat", nodes, gbit, us, times)
 
     assert 0 < at(64) < at(8) < 1
     assert max(at(8, gbit=25), at(8, us=500), at(8, times=10)) < at(8)
 
 
 def test_where_it_breaks_is_the_first_number_of_nodes_below_the_mark():
-    network = scaling.Network(100, 50)
-    first = scaling.breaks_at(KNOWN, "ant", "flat", network)
+    network = (100.0, 50.0)
+    first = scaling.breaks_at(KNOWN, "ant", "flat", *network)
     assert first is not None
-    assert scaling.efficiency(KNOWN, "ant", "flat", first, network) < scaling.ENOUGH
-    assert scaling.efficiency(KNOWN, "ant", "flat", first - 1, network) >= scaling.ENOUGH
-    assert scaling.breaks_at(KNOWN, "ant", "flat", scaling.Network(1e6, 0)) is None
+    assert scaling.efficiency(KNOWN, "ant", "flat", first, *network) < scaling.ENOUGH
+    assert scaling.efficiency(KNOWN, "ant", "flat", first - 1, *network) >= scaling.ENOUGH
+    assert scaling.breaks_at(KNOWN, "ant", "flat", 1e6, 0) is None
 
 
 def test_what_was_measured_is_from_the_files():

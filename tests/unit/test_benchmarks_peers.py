@@ -16,8 +16,10 @@ import jax.numpy as jnp
 import pytest
 from brax.training.agents.ppo import networks, train
 
-from benchmarks import runner
-from benchmarks.evaluation import peer_tables
+from benchmarks import records, runner
+from benchmarks.evaluation.figures import NOT_MEASURED
+from benchmarks.evaluation.page import TABLES
+from benchmarks.evaluation.peer_tables import row
 from benchmarks.peers import __main__ as peers
 from benchmarks.peers import returns
 from benchmarks.peers.brax_ppo import replicated
@@ -25,12 +27,12 @@ from benchmarks.peers.comparisons import (
     BRAX,
     COMPARISONS,
     MJLAB,
+    OURS,
     REPORTS,
     Comparison,
     brax_training,
 )
 from benchmarks.peers.side import Side
-from benchmarks.peers.table import OURS, row
 from benchmarks.records import read_calls
 from gmijax.cli.compose import compose
 from gmijax.config import RolloutConfig
@@ -144,10 +146,12 @@ def test_returns_are_kept_up_to_where_a_run_failed(
         "sys.exit('no room' if seed else 0)"
     )
 
-    def started(told: Sequence[str], variables: dict[str, str], log: Any) -> Any:
-        return runner.start([sys.executable, "-c", script, *told[-2:]], variables, log)
+    start = runner.start
 
-    monkeypatch.setattr(returns, "start", started)
+    def started(told: Sequence[str], variables: dict[str, str], log: Any) -> Any:
+        return start([sys.executable, "-c", script, *told[-2:]], variables, log)
+
+    monkeypatch.setattr(runner, "start", started)
     tasks = {f"a-{seed}": returns.told("PointMass", (), seed) for seed in (0, 1)}
     curve = [[100, 1.0], [200, 2.0]]
     assert returns.train(tasks, tmp_path, 60.0) == {
@@ -190,7 +194,7 @@ def benchmark(
     monkeypatch: pytest.MonkeyPatch, folder: Path, fake: Fake, *only: str, **options: Any
 ) -> peers.Benchmark:
     for name in ("start", "wait_until"):
-        monkeypatch.setattr(peers, name, getattr(fake, name))
+        monkeypatch.setattr(runner, name, getattr(fake, name))
     monkeypatch.setattr(peers.os, "cpu_count", lambda: 8)
     arguments = {"repeats": 3, "timeout_s": 600.0, "deadline_s": None, **options}
     sides = [side for side in peers.wanted_sides(only, ()) if "Warp" not in side.comparison]
@@ -225,14 +229,14 @@ def test_what_does_not_compile_is_told_once(tmp_path: Path, monkeypatch: pytest.
 def test_the_table_takes_the_newest_call_that_measured_both_sides(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(peer_tables, "RESULTS", tmp_path)
-    assert peer_tables.peers()[0].endswith("not measured (`python -m benchmarks.peers`).")
+    monkeypatch.setattr(records, "RESULTS", tmp_path)
+    assert TABLES["peers"]() == [NOT_MEASURED]
     made = benchmark(monkeypatch, tmp_path, Fake(), "ant, MJX-JAX", repeats=1)
     benchmark(monkeypatch, tmp_path / "2", Fake("gmijax.train"), "ant, MJX-JAX", repeats=1)
     calls = [json.loads(made.file.path.read_text())["calls"][0]]
     calls += json.loads((tmp_path / "2" / made.file.path.name).read_text())["calls"]
     path = tmp_path / "peers-nvidia-h200.json"
     path.write_text(json.dumps({"format": 2, "suite": "peers", "calls": calls}))
-    table = peer_tables.peers()
+    table = TABLES["peers"]()
     assert "| ant, MJX-JAX | Brax | 200 | 100 | 2.00 | 60.0 | 60.0 |" in table
-    assert sum("not measured" in line for line in table) == len(COMPARISONS) - 1
+    assert sum(NOT_MEASURED in line for line in table) == len(COMPARISONS) - 1

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import json
+import re
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -14,8 +17,9 @@ import pytest
 from supervision import machine
 
 from benchmarks import records, runner
+from benchmarks.free_gpus import FreeGpus, on_free_gpus
 from benchmarks.records import read_calls
-from benchmarks.runner import FreeGpus, exit_code, failure_of, in_turn, start, wait_until
+from benchmarks.runner import exit_code, failure_of, in_turn, start, wait_until
 from gmijax.errors import ConfigError
 
 
@@ -79,6 +83,18 @@ def test_free_gpus_are_given_back():
         assert (first, second) == ((0, 1), (2,))
     with free.taken(3) as all_of_them:
         assert all_of_them == (0, 1, 2)
+
+
+def test_turns_get_as_many_gpus_as_they_need_or_none():
+    def run(turn: int, gpus: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
+        if turn > 2:
+            raise ConfigError("needs too many")
+        return turn, gpus
+
+    assert on_free_gpus(None, [1, 2], lambda turn: turn, run) == [(1, ()), (2, ())]
+    assert on_free_gpus(2, [2, 2], lambda turn: turn, run) == [(2, (0, 1))] * 2
+    with pytest.raises(ConfigError, match="needs too many"):
+        on_free_gpus(3, [1, 3], lambda turn: turn, run)
 
 
 @pytest.mark.parametrize(
@@ -210,8 +226,9 @@ def run_benchmark(
 ) -> int:
     module = importlib.import_module(f"benchmarks.{name}")
     for function, fake in (("run_command", commands.run), ("failure_of", commands.failure_of)):
-        if hasattr(module, function):
-            monkeypatch.setattr(module, function, fake)
+        for user in (runner, module):
+            if hasattr(user, function):
+                monkeypatch.setattr(user, function, fake)
     for user in (records, module):
         if hasattr(user, "detect_machine"):
             monkeypatch.setattr(user, "detect_machine", lambda: machine(0))
@@ -233,6 +250,16 @@ def test_a_benchmark_runs_its_commands_and_adds_a_call(
     assert first.device == "cpu"
     assert first.settings == second.settings
     assert first.results.keys() == second.results.keys()
+
+
+def test_seeds_without_a_row_are_of_one_setting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    arguments, file, commands = ["env=ant", "--seeds", "2"], *BENCHMARKS["seeds"][1:]
+    monkeypatch.setitem(BENCHMARKS, "seeds", (arguments, file, commands))
+    made = Commands()
+    assert run_benchmark("seeds", tmp_path, monkeypatch, made) == 0
+    assert made.made == commands[:1]
+    (call,) = read_calls(tmp_path / f"{file}.json")
+    assert [row["row"] for row in call.results["rows"]] == ["baseline"]
 
 
 @pytest.mark.parametrize("name", ["seeds", "packs"])
@@ -277,3 +304,35 @@ def test_a_suite_without_a_case_to_run_is_refused(
     monkeypatch.setattr(sys, "argv", ["run", "--out", str(tmp_path), *arguments])
     assert exit_code(importlib.import_module("benchmarks.run").main) == 2
     assert capsys.readouterr().err.startswith(error)
+
+
+class Taken(Exception):
+    """Its options were taken: it would begin to measure."""
+
+
+def written_commands() -> list[str]:
+    """Of the plan and the documents, what stands behind `python -m benchmarks.`."""
+    root = Path(runner.__file__).parents[1]
+    found = []
+    for path in (root / "benchmarks" / "plan.md", *sorted((root / "docs").rglob("*.md"))):
+        text = path.read_text().replace("\\\n", " ")
+        found += re.findall(r"(?:^|`)python -m benchmarks\.([^`\n]+)", text, re.MULTILINE)
+    return [one for one in dict.fromkeys(found) if " " in one]
+
+
+@pytest.mark.parametrize("command", written_commands())
+def test_commands_that_are_written_down_are_taken(command: str, monkeypatch: pytest.MonkeyPatch):
+    for name in ("parse_args", "parse_intermixed_args"):
+        parse = getattr(argparse.ArgumentParser, name)
+
+        def parsed(self: Any, *given: Any, parse: Any = parse, **named: Any) -> None:
+            parse(self, *given, **named)
+            raise Taken
+
+        monkeypatch.setattr(argparse.ArgumentParser, name, parsed)
+    module, *words = shlex.split(command)
+    if module == "peers":
+        module = "peers.__main__"
+    monkeypatch.setattr(sys, "argv", [module, *words])
+    with pytest.raises(Taken):
+        importlib.import_module(f"benchmarks.{module}").main()

@@ -13,15 +13,17 @@ import pytest
 from supervision import save_meta
 
 import gmijax
-from benchmarks import walking, walking_tests
-from benchmarks.evaluation import walking_tables
+from benchmarks import records, walking, walking_tests
 from benchmarks.evaluation.figures import NOT_MEASURED
+from benchmarks.evaluation.page import TABLES
 from benchmarks.records import ResultsFile, read_calls
 from benchmarks.walking import _theirs, summary, walks_from
 from benchmarks.walking_tests import Policy, policy_of, walks_twice
 from gmijax.config import EnvConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import Machine
 from gmijax.player.policy import PlainPolicy, write_policy
 from gmijax.runs.folder import POLICY, RunPaths, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta
@@ -62,6 +64,41 @@ def test_a_folder_of_trainings_is_not_used_twice(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["walking", *overrides])
     with pytest.raises(ConfigError, match=f"^--runs={tmp_path}: has a gmijax-compile already$"):
         walking.main()
+
+
+def test_every_seed_is_trained_and_tested_on_a_gpu_of_its_own(tmp_path, monkeypatch):
+    gpus = tuple(Gpu(n, f"GPU-{n}", "some GPU", 80000, (9, 0), False) for n in (0, 1))
+    monkeypatch.setattr(walking, "detect_machine", lambda: Machine(gpus, tuple(range(8))))
+    ran = []
+
+    def run_command(command, deadline_s, variables):
+        ran.append((command[2], variables.get("CUDA_VISIBLE_DEVICES"), command))
+        if "benchmarks.walking_tests" in command:
+            asked = read_json(Path(command[-2]))
+            walks = [[{"walks": True}] * len(run) for run in asked["runs"]]
+            write_json(Path(command[-1]), {"walks": walks})
+            return 0
+        own = dict(word.split("=", 1) for word in command if "=" in word)
+        for steps in (10, 20):
+            meta = CheckpointMeta("go1", "ppo", steps, 1, 64, ((8,), (8,)), "warp")
+            save_meta(RunPaths(Path(own["run.dir"])), meta)
+        return 0
+
+    monkeypatch.setattr(walking, "run_command", run_command)
+    given = ("env=go1", "num_envs=64", "--gpus=2", f"--runs={tmp_path}", f"--out={tmp_path}")
+    monkeypatch.setattr("sys.argv", ["walking", *given])
+    assert walking.main() == 0
+    found = {}
+    for cores, gpu, command in ran[1:]:  # The first one compiles, and sees all.
+        assert cores == {"0": "0,1,2,3", "1": "4,5,6,7"}[gpu]
+        found.setdefault(gpu, []).extend(word for word in command if word.startswith("seed="))
+    assert ran[0][1] is None
+    assert found == {"0": ["seed=0", "seed=2", "seed=4"], "1": ["seed=1", "seed=3"]}
+    (path,) = tmp_path.glob("walking-go1-*.json")
+    (call,) = read_calls(path)
+    assert call.device == "1 x some GPU"
+    assert [run["seed"] for run in call.results["runs"]] == [0, 1, 2, 3, 4]
+    assert call.results["rows"]["gmijax"]["walk"] == 5
 
 
 def test_tests_end_with_the_second_in_a_row_that_walks():
@@ -195,24 +232,32 @@ def test_a_policy_of_brax_gets_its_observations_by_name(tmp_path):
 
 
 def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypatch):
-    monkeypatch.setattr(walking_tables, "RESULTS", tmp_path)
-    assert walking_tables.walking() == [NOT_MEASURED]
+    monkeypatch.setattr(records, "RESULTS", tmp_path)
+    assert TABLES["walking"]() == [NOT_MEASURED]
     row = {"seeds": 5, "walk": 5, "env_steps": [4e7, 5e7, 6e7]}
-    for is_cold, seconds in ((False, 99.0), (False, 60.0), (True, 100.0)):
+    sac = ["env=go1", "algo=sac"]
+    for is_cold, seconds, given in (
+        (False, 99.0, []),
+        (False, 60.0, ["env=go1"]),
+        (True, 100.0, []),
+        (False, 70.0, sac),
+    ):
         path = tmp_path / "walking-go1-nvidia-h100.json"
-        file = ResultsFile(path, "walking", {"cold": is_cold}, device="H100")
+        settings = {"cold": is_cold, "overrides": given}
+        file = ResultsFile(path, "walking", settings, device="H100")
         spread = {"training_s": [50.0, seconds, 120.0], "command_s": None}
         errors = {"linear_m_per_s": seconds / 1000, "yaw_rad_per_s": None}
         tested = {"env_steps": 7e7, "walk": {"upright": 0.995, "settled": errors}}
         runs = [{"trainer": "gmijax", "checkpoints": [tested, {"env_steps": 8e7}]}] * 5
         with file.changing() as results:
             results.update(task="go1", rows={"gmijax": row | spread}, runs=runs)
-    lines = walking_tables.walking()
+    lines = TABLES["walking"]()
     rows = [line for line in lines if line.startswith("| `go1`")]
-    walk, share = "5 of 5 | 50 (40 to 60)", "70 | 99.5%"
+    walk, share, most = "5 of 5 | 50 (40 to 60)", "70 | 99.5%", "(50 to 120)"
     assert rows == [
-        f"| `go1` | gmijax | from the cache | {walk} | 60 (50 to 120) |  | {share} | 0.06 |  |",
-        f"| `go1` | gmijax | compiled anew | {walk} | 100 (50 to 120) |  | {share} | 0.10 |  |",
+        f"| `go1` | gmijax PPO | from the cache | {walk} | 60 {most} |  | {share} | 0.06 |  |",
+        f"| `go1` | gmijax PPO | compiled anew | {walk} | 100 {most} |  | {share} | 0.10 |  |",
+        f"| `go1` | gmijax SAC | from the cache | {walk} | 70 {most} |  | {share} | 0.07 |  |",
     ]
 
 

@@ -6,6 +6,7 @@ import builtins
 import json
 import os
 import signal
+import socket
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,6 +27,7 @@ from gmijax.cluster.node import (
     RemoteGmiStatus,
     TrainingNode,
     address_of,
+    interface_of,
     own_versions,
 )
 from gmijax.cluster.ray_nodes import NodeHandle, RayCluster
@@ -308,6 +310,8 @@ def test_an_interface_is_an_address_or_a_line_that_names_those_there_are() -> No
     assert address_of("lo") == "127.0.0.1"
     with pytest.raises(ConfigError, match=r"cluster.interface=eth99: .*it has lo"):
         address_of("eth99")
+    assert interface_of("127.0.0.1") == "lo"
+    assert interface_of("192.0.2.1") is None
 
 
 def test_who_waited_in_vain_comes_before_who_lost_that_one() -> None:
@@ -418,3 +422,30 @@ def test_a_node_starts_polls_and_ends_gmis(
     assert seen.exit_code == -signal.SIGKILL
     node.close()
     assert not (tmp_path / "node_0").exists()
+
+
+@pytest.mark.parametrize(
+    ("users", "address", "expected"),
+    [(None, "127.0.0.1", "=lo"), ("eth1", "127.0.0.1", "eth1"), (None, "192.0.2.1", None)],
+)
+def test_nccl_of_a_node_takes_the_network_of_its_address_unless_the_user_says_another(
+    users: str | None,
+    address: str,
+    expected: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(nodes, "detect_machine", lambda: machine(0))
+    monkeypatch.setattr(nodes, "listen", lambda _: socket.create_server(("127.0.0.1", 0)))
+    # A node changes both; so that they are as before after the test.
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NCCL_SOCKET_IFNAME", "")
+    monkeypatch.delenv("NCCL_SOCKET_IFNAME")
+    here = {name: machine(0) for name in "ab"}
+    plan = make_plan(PlanConfig(), ReduceConfig(), 16, machine(0), nodes=here)
+    variables = {} if users is None else {"NCCL_SOCKET_IFNAME": users}
+    node = TrainingNode(variables, str(tmp_path), None, address)
+    launch = make_launch(RunPaths(tmp_path), ["train", "train"], plan)
+    assert not isinstance(node.open(launch, 0, address, {}), BackendUnavailable)
+    node.close()
+    assert os.environ.get("NCCL_SOCKET_IFNAME") == expected

@@ -31,5 +31,8 @@ def test_a_fall_back_to_host_memory_is_told(
 ) -> None:
     monkeypatch.setattr("gmijax.partition.reduction.is_installed", lambda *_: True)
     plan = make_plan(machine(1), {"strategy": planned}, gmis_per_gpu=2, backend="share")
-    comm: Any = SimpleNamespace(strategy=strategy, intra=intra)
+    comm: Any = SimpleNamespace(strategy=strategy, intra=intra, inter=None)
     assert exchange_used(plan, comm) == said
+    # On several nodes also how these exchange.
+    comm.inter = "tcp"
+    assert exchange_used(plan, comm) == said | {"inter": "tcp"}

@@ -6,6 +6,7 @@ import os
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gmijax.clock import running_s
 from gmijax.collectives.communicator import (
     CommunicatorConfig,
     MultiRankCommunicator,
@@ -22,6 +24,7 @@ from gmijax.collectives.communicator import (
 )
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
 from gmijax.collectives.host_transport import HostTransport
+from gmijax.collectives.nodes.leader_watch import LeaderWatch
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.nodes.rendezvous import NodeAddresses, connect, listen
@@ -66,6 +69,17 @@ def meshes(request: pytest.FixtureRequest) -> Iterator[list[Mesh]]:
     yield found
     for mesh in found:
         mesh.close()
+
+
+@pytest.fixture
+def watches(request: pytest.FixtureRequest) -> Iterator[list[LeaderWatch]]:
+    num_nodes = getattr(request, "param", 2)
+    ids = [10 * node for node in range(num_nodes)]
+    sockets = meet([TOKEN] * num_nodes)
+    found = [LeaderWatch(own, node, ids) for node, own in enumerate(sockets)]
+    yield found
+    for watch in found:
+        watch.close()
 
 
 def at_once(*calls: Callable[[], Any]) -> list[Any]:
@@ -115,6 +129,45 @@ def test_a_leader_that_hangs_up_and_one_that_does_something_else_are_named(
 def test_a_leader_that_does_not_come_is_named_in_time(meshes: list[Mesh]) -> None:
     with pytest.raises(CollectiveTimeout, match=r"0\.3 s in sum between nodes.*GMIs \[10\]"):
         meshes[0].all_reduce(np.ones(3, np.float32), 1)
+
+
+@pytest.mark.parametrize("watches", [3], indirect=True)
+def test_leaders_meet_and_who_has_met_may_hang_up(watches: list[LeaderWatch]) -> None:
+    def come_and_go(watch: LeaderWatch) -> None:
+        for step in range(20):
+            watch.meet(10.0, "step", step, lambda: None)
+        watch.close()
+
+    met = at_once(*(lambda watch=watch: come_and_go(watch) for watch in watches))
+    assert met == [None] * 3
+
+
+def test_a_leader_that_hangs_up_before_the_meeting_is_lost(watches: list[LeaderWatch]) -> None:
+    watches[0].look(running_s(), 10.0, "step", 7)
+    watches[1].close()
+    lost = r"GMI 0: GMI 10 is gone during step of several nodes, step 7"
+    with pytest.raises(PeerLost, match=lost):
+        watches[0].meet(10.0, "step", 7, lambda: None)
+    with pytest.raises(PeerLost, match=lost):
+        watches[0].look(running_s(), 10.0, "step", 7)
+
+
+def test_time_counts_only_while_a_leader_is_silent(watches: list[LeaderWatch]) -> None:
+    mine, other = watches
+    since_s = running_s()
+    for _ in range(8):
+        time.sleep(0.1)
+        other.beat()
+        mine.look(since_s, 0.5, "step", 3)  # It is heard, for longer than the limit.
+    waited: list[int] = []
+    with pytest.raises(
+        CollectiveTimeout, match=r"waited 0\.5 s in step .*for GMIs \[10\]"
+    ) as late:
+        mine.meet(0.5, "step", 3, lambda: waited.append(1))
+    assert late.value.missing == (10,)
+    assert waited
+    # It may come to the first wait of a long time late, and not be blamed for what was before.
+    mine.look(running_s(), 0.5, "step", 4)
 
 
 def test_who_does_not_know_the_secret_stays_out() -> None:

@@ -32,7 +32,7 @@ def test_the_plan_of_nodes_has_each_nodes_shares_under_global_ids() -> None:
     assert plan.layout.gmis_of_gpu == ((0, 1), (2, 3))
     assert [allocation.gpu for allocation in plan.allocations] == [0, 0, 1, 1]
     assert plan.allocations[2].cpus == plan.allocations[0].cpus
-    assert plan.strategy == "mpr"
+    assert (plan.strategy, plan.inter) == ("mpr", "tcp")
     assert plan.nodes_data()[1] == {"address": "10.0.0.2", "gmis": [2, 3]}
     assert Plan.from_dict(plan.to_dict()) == plan
     old = {key: value for key, value in plan.to_dict().items() if key != "nodes"}
@@ -55,16 +55,74 @@ def test_gmis_of_nodes_share_the_gpus_of_their_node() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gpus", "gmis", "strategy"),
-    [(1, 2, "one_shot"), (2, 2, "one_shot"), (2, 1, "mrr"), (1, 1, "mpr")],
+    ("gpus", "gmis", "named", "strategy", "inter"),
+    [
+        (1, 1, "auto", "flat", "nccl"),
+        (2, 1, "auto", "flat", "nccl"),
+        (1, 2, "auto", "one_shot", "nccl"),
+        (2, 2, "auto", "one_shot", "nccl"),
+        (2, 2, "paper", "mrr", "nccl"),
+        (1, 2, "har", "har", "nccl"),
+        (1, 1, "flat", "flat", "nccl"),
+        (1, 1, "paper", "mpr", "tcp"),
+        (2, 2, "mpr", "mpr", "tcp"),
+    ],
 )
-def test_nodes_with_gpus_do_inside_what_one_machine_does(
-    gpus: int, gmis: int, strategy: str, monkeypatch: pytest.MonkeyPatch
+def test_nodes_with_gpus_exchange_by_nccl_but_for_mpr(
+    gpus: int, gmis: int, named: str, strategy: str, inter: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gmijax.partition.reduction.is_installed", lambda *_: True)
-    plan = plan_on(gpus_of_nodes(gpus, gpus), gpus=gpus, gmis_per_gpu=gmis)
-    assert plan.strategy == strategy
-    assert [stage.transport for stage in stages(strategy, plan.layout)][-1] == "nodes"
+    nodes = gpus_of_nodes(gpus, gpus)
+    settings = PlanConfig(gpus=gpus, gmis_per_gpu=gmis), ReduceConfig(strategy=named), 16
+    plan = make_plan(*settings, nodes["10.0.0.0"], nodes=nodes)
+    assert (plan.strategy, plan.inter) == (strategy, inter)
+    assert [why for why in plan.reasons if why.startswith(f"inter {inter}: ")]
+    transports = [s.transport for s in stages(strategy, plan.layout, plan.intra, plan.inter)]
+    assert ("nodes" in transports, "ring" in transports) == (inter == "tcp", inter == "nccl")
+    assert Plan.from_dict(plan.to_dict()) == plan
+    old = {key: value for key, value in plan.to_dict().items() if key != "inter"}
+    assert Plan.from_dict(old).inter is None
+
+
+@pytest.mark.parametrize(
+    ("missing", "gmis", "strategy", "why"),
+    [
+        ("nccl", 1, "mpr", "need the package nccl4py"),
+        ("nccl", 2, "one_shot", "need the package nccl4py"),
+        ("cuda", 1, "mpr", "need the package cuda-bindings"),
+    ],
+)
+def test_nodes_without_nccl_exchange_by_tcp(
+    missing: str, gmis: int, strategy: str, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "gmijax.partition.reduction.is_installed", lambda *modules: missing not in modules
+    )
+    plan = plan_on(gpus_of_nodes(1, 1), gmis_per_gpu=gmis)
+    assert (plan.strategy, plan.inter) == (strategy, "tcp")
+    [reason] = [reason for reason in plan.reasons if reason.startswith("inter tcp: ")]
+    assert why in reason
+    if missing == "nccl" and gmis == 1:
+        nodes, named = gpus_of_nodes(1, 1), ReduceConfig(strategy="flat")
+        with pytest.raises(ConfigError, match=r"reduce\.strategy=flat: .* nccl4py"):
+            make_plan(PlanConfig(), named, 16, nodes["10.0.0.0"], nodes=nodes)
+
+
+def test_nodes_of_one_machine_that_have_one_gpu_exchange_by_tcp(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("gmijax.partition.reduction.is_installed", lambda *_: True)
+    plan = plan_on({"a": machine(1), "a#1": machine(1)}, backend="share")
+    assert (plan.strategy, plan.inter) == ("mpr", "tcp")
+    assert any("inter tcp: " in why and "the same GPU" in why for why in plan.reasons)
+
+
+def test_nccl_between_nodes_listens_where_the_node_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gmijax.partition.reduction.is_installed", lambda *_: True)
+    plan = plan_on(gpus_of_nodes(1, 1))
+    assert "NCCL_SOCKET_IFNAME" not in gmi_environment(plan, 1, {}, Path("/cache"), {})
+    own = {"NCCL_SOCKET_IFNAME": "=eth1"}
+    assert own.items() <= gmi_environment(plan, 1, own, Path("/cache"), {}).items()
 
 
 def test_a_gpu_of_two_nodes_of_one_machine_has_half_of_its_memory_for_each() -> None:

@@ -182,7 +182,7 @@ def _all_reduce(strategy: str, num_floats: int) -> Iterator[StagedAllReduce]:
     if strategy == "one_shot":
         transport = DeviceTransport(control, host, layout, num_floats, parts, FAKES["fake"])
     all_reduce = StagedAllReduce(transport, parts, 0, 1)
-    transport.start(all_reduce.is_right)
+    transport.start([all_reduce.is_right])
     yield all_reduce
     all_reduce.close()
     host.close()

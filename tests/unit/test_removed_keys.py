@@ -70,3 +70,14 @@ def test_a_run_that_was_trained_otherwise_is_refused_by_the_key(key: str, tmp_pa
     run = _run_with(tmp_path, key, "other")
     with pytest.raises(ConfigError, match=f"does not know: {key};"):
         compose(f"run.resume={run.root}")
+
+
+def test_a_run_of_sac_with_an_agent_of_its_own_is_told_what_to_write(tmp_path: Path) -> None:
+    run, key = RunPaths(tmp_path / "old"), "plan.serving_gmis_per_gpu"
+    save(run, 100)
+    saved = to_dict(compose("env=ant", "algo=sac", "num_envs=1024"))
+    saved["plan"]["serving_gmis_per_gpu"] = 1
+    write_json(run.config, saved)
+    with pytest.raises(ConfigError, match=rf"^{key}=1: .* write {key}=null$"):
+        compose(f"run.resume={run.root}")
+    assert not compose(f"run.resume={run.root}", f"{key}=null").is_decoupled

@@ -443,6 +443,9 @@ def test_it_learns_and_says_where_the_range_of_returns_is_too_small() -> None:
         ("algo.recompute_advantages=true", "algo.recompute_advantages"),
         ("algo.clipping_epsilon=0.2", "algo.clipping_epsilon"),
         ("plan.template=tdg_ex", "plan.template=tdg_ex: not for gmijax.train with algo=sac"),
+        ("plan.template=decoupled", "plan.template=decoupled: not for .* algo=sac"),
+        ("plan.serving_gmis_per_gpu=1", "=1: .*every GMI acts .*plan.serving_gmis_per_gpu=null$"),
+        ("plan.training_gpus=[0]", r"=\[0\]: .*every GMI acts .*plan.training_gpus=null$"),
     ],
 )
 def test_what_does_not_fit_is_refused(override: str, message: str) -> None:

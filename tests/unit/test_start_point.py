@@ -129,8 +129,7 @@ def test_a_saved_replay_has_to_fit_only_where_it_is_gone_on_with(tmp_path: Path)
         (2, "save_replay=false", False, True),
         (1, "replay_steps=512", False, True),
     ):
-        roles = ("simulator+agent+trainer",) * num_gmis
-        plan: Any = SimpleNamespace(layout=SimpleNamespace(num_gmis=num_gmis), roles=roles)
+        plan: Any = SimpleNamespace(layout=SimpleNamespace(num_gmis=num_gmis))
         own = compose(*line, f"run.resume={checkpoint}", f"algo.{key}")
         with (
             pytest.raises(ConfigError, match=f"algo.{key}: the replay in the checkpoint")

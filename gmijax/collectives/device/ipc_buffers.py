@@ -67,7 +67,8 @@ class IpcBuffers:
         self._host: SharedMemoryGroup | None = here
         here.flags[here.rank, 1] = 0
         try:
-            ipc_handles = all_or_none(host, wish, lambda: self._make(new_memory))
+            of_job = all_or_none(host, wish, lambda: self._make(new_memory))
+            ipc_handles = of_job[host.rank - here.rank :][: here.world_size]
             all_or_none(host, wish, lambda: self._map(ipc_handles))
         except BaseException:
             self.close()
@@ -98,7 +99,7 @@ class IpcBuffers:
     ) -> None:
         """Queues a copy of what the first member has; as `all_gather`, but `target` has [n]."""
         num_bytes = 4 * num_floats
-        self._write(queue, stream, source, num_bytes)
+        self._write(queue, stream, source, num_bytes if self._rank == self._members[0] else 0)
         queue.copy(stream, target, self._slot(0), num_bytes)
 
     def close(self) -> None:
@@ -121,11 +122,12 @@ class IpcBuffers:
         """Queues a write of this rank's slots, and a wait for all other members' writes.
 
         For all of them: whoever writes a slot again must know that all have read the other one.
+        So a rank raises its flag also if it has nothing to write.
         """
         self._num_writes += 1
         count = self._num_writes & 0xFFFFFFFF
         own = self._slot(self._members.index(self._rank)) - self._memories[0].address
-        for memory in self._memories:
+        for memory in self._memories if num_bytes else ():
             queue.copy(stream, memory.address + own, source, num_bytes)
         queue.raise_flag(stream, self._rank, count)
         for member in self._members:

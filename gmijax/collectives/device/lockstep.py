@@ -1,4 +1,8 @@
-"""Runs a step on the devices of all ranks: they meet before and after, and watch their peers."""
+"""Runs a step on the devices of all ranks: they meet before and after, and watch their peers.
+
+On several nodes the ranks of each meet before, and all of them after a step; meanwhile the leaders
+watch each other, because a device that waits for another node in a ring tells nobody.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,9 @@ import atexit
 from collections.abc import Callable
 from typing import TypeVar
 
+from gmijax.collectives.all_or_none import Group
 from gmijax.collectives.device.watched_thread import WatchedThread, end_at_once
-from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 
 T = TypeVar("T")
 
@@ -15,8 +20,8 @@ T = TypeVar("T")
 class LockstepRunner:
     """One rank's part in steps of all ranks, which must agree on `num_floats`."""
 
-    def __init__(self, host: SharedMemoryGroup, num_floats: int) -> None:
-        self._barrier = host.barrier
+    def __init__(self, group: Group, num_floats: int) -> None:
+        self._group, self._barrier = group, group.local.barrier
         self._num_floats = num_floats
         self._thread = WatchedThread("step")
         self._is_running = False
@@ -46,6 +51,9 @@ class LockstepRunner:
             result = self._thread.run(program, barrier.watch)
         # Some have given it to their devices a step before others.
         barrier.wait(while_unresponsive=True)
+        if isinstance(self._group, MultiNodeGroup):
+            self._group.meet_leaders()
+            barrier.wait(while_unresponsive=True)
         barrier.end()
         return result
 

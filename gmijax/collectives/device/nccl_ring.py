@@ -45,13 +45,14 @@ class NcclRing:
 def nccl_ring(group: Group, rings: Groups) -> NcclRing | None:
     """Joins the ring that this rank is in, None if it is in none; all ranks of the job call it.
 
-    On several nodes rings are in each of them, and `rings` are of ranks in the node.
+    `rings` are of ranks in the job; the members of one may be on several nodes. Where they listen
+    NCCL decides, by `NCCL_SOCKET_IFNAME`.
 
     Raises:
       DeviceMemoryUnavailable: NCCL is not to be had, or refuses; on all ranks alike.
     """
     joined: list[NcclRing] = []
-    rank = group.local.rank
+    rank = group.rank
     members = next((ring for ring in rings if rank in ring), ())
 
     def make_id() -> bytes:

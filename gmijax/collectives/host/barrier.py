@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from typing import Protocol
 
 from gmijax.clock import running_s
 from gmijax.collectives.host.failure_detector import FailureDetector
@@ -31,11 +32,29 @@ SETTLE_S = 2.0
 """How long to look for a dead peer after a transfer failed: the error comes before the death."""
 
 
+class OtherNodes(Protocol):
+    """The leaders of other nodes, as the leader of this one sees them: `LeaderWatch`."""
+
+    def beat(self) -> None:
+        """Tells them that this node waits; called five times a second in every wait."""
+        ...
+
+    def look(self, since_s: float, timeout_s: float, operation: str, step: int) -> None:
+        """Raises PeerLost or CollectiveTimeout for one that this node cannot wait for."""
+        ...
+
+
 class Barrier:
-    """One rank's side of the waiting; for the times see `SharedMemoryGroup`."""
+    """One rank's side of the waiting; for the times see `SharedMemoryGroup`.
+
+    Attributes:
+      step: number of calls so far.
+      other_nodes: of the leader of one of several nodes, else None.
+    """
 
     def __init__(self, block: SharedBlock, timeout_s: float, rendezvous_timeout_s: float) -> None:
         self.step = 0
+        self.other_nodes: OtherNodes | None = None
         self._first_step = 1
         self._block = block
         self._timeout_s = timeout_s
@@ -99,10 +118,11 @@ class Barrier:
           PeerLost: the process of a peer is gone.
           CollectiveTimeout: a peer is unresponsive, or all have come out of it but this rank.
         """
-        detector = self._detector()
+        detector, since_s = self._detector(), running_s()
         while not done.wait(LIVENESS_PERIOD_S):
             detector.look(lambda: self._peers, while_unresponsive=True)
-            if detector.is_late:
+            self._look_at_other_nodes(since_s)
+            if self._peers and detector.is_late:
                 detector.give_up(self._peers)
 
     @contextmanager
@@ -142,11 +162,21 @@ class Barrier:
         """Tells the others that this rank will not come again."""
         self._block.lines["pid"][self._block.rank] = 0
 
+    @property
+    def limit_s(self) -> float:
+        """Longest wait in the call that is open."""
+        is_first = self.step <= self._first_step
+        return self._rendezvous_timeout_s if is_first else self._timeout_s
+
+    def _look_at_other_nodes(self, since_s: float) -> None:
+        if self.other_nodes is not None:
+            self.other_nodes.look(since_s, self.limit_s, self._operation, self.step)
+
     def _look_for_a_cause(self) -> None:
-        detector = self._detector()
-        deadline_s = running_s() + SETTLE_S
-        while running_s() < deadline_s:
+        detector, since_s = self._detector(), running_s()
+        while running_s() < since_s + SETTLE_S:
             detector.look(lambda: self._peers)
+            self._look_at_other_nodes(since_s)
             time.sleep(0.02)
         if unresponsive := detector.unresponsive(self._peers):
             detector.give_up(unresponsive)
@@ -184,9 +214,10 @@ class Barrier:
         self._fence()
 
     def _detector(self) -> FailureDetector:
-        is_first = self.step <= self._first_step
-        timeout_s = self._rendezvous_timeout_s if is_first else self._timeout_s
-        return FailureDetector(self._block, self._operation, self.step, timeout_s)
+        detector = FailureDetector(self._block, self._operation, self.step, self.limit_s)
+        if self.other_nodes is not None:
+            detector.on_look = self.other_nodes.beat
+        return detector
 
     def _missing(self, peers: list[int], target: int) -> list[int]:
         counter_of = self._sequence.item

@@ -20,9 +20,14 @@ SILENCE_S = 0.7
 
 
 class FailureDetector:
-    """One wait of one rank, from its start, in `operation`, which is call number `step`."""
+    """One wait of one rank, from its start, in `operation`, which is call number `step`.
+
+    Attributes:
+      on_look: called at every `look`.
+    """
 
     def __init__(self, block: SharedBlock, operation: str, step: int, timeout_s: float) -> None:
+        self.on_look: Callable[[], None] = lambda: None
         self._block = block
         self._operation = operation
         self._step = step
@@ -47,6 +52,7 @@ class FailureDetector:
           CollectiveTimeout: the time is up.
         """
         self._block.lines["heartbeats"][self._block.rank] += 1
+        self.on_look()
         self._check_alive(missing)
         self._listen()
         left = missing()

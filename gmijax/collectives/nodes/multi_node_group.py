@@ -7,6 +7,7 @@ import numpy as np
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.interface import FloatBuffer
+from gmijax.collectives.nodes.leader_watch import LeaderWatch
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.strategies import Groups
 from gmijax.partition.layout import Layout
@@ -25,13 +26,20 @@ class MultiNodeGroup:
       layout: of the job.
       rank: of this process in the job.
       mesh: with the leaders of other nodes, None for ranks that do not lead.
+      watch: the same, to see whether they live; the waits in `local` use it from here on.
     """
 
     def __init__(
-        self, local: SharedMemoryGroup, layout: Layout, rank: int, mesh: Mesh | None
+        self,
+        local: SharedMemoryGroup,
+        layout: Layout,
+        rank: int,
+        mesh: Mesh | None = None,
+        watch: LeaderWatch | None = None,
     ) -> None:
         self.rank, self.world_size = rank, layout.num_gmis
-        self.local, self._mesh = local, mesh
+        self.local, self._mesh, self._watch = local, mesh, watch
+        local.barrier.other_nodes = watch
         self._here = layout.gmis_of_node[layout.node_of(rank)]
 
     def all_reduce(
@@ -81,9 +89,21 @@ class MultiNodeGroup:
             self._mesh.restart()
         return gathered
 
+    def meet_leaders(self) -> None:
+        """Waits for the leaders of all nodes in the call of `local` that is open.
+
+        Raises:
+          PeerLost, CollectiveTimeout: see `LeaderWatch`.
+        """
+        if self._watch is not None:
+            barrier = self.local.barrier
+            self._watch.meet(barrier.limit_s, "step", barrier.step, self.local.heartbeat)
+
     def close(self) -> None:
         """Gives the memory back and hangs up. Idempotent."""
         self.local.close()
+        if self._watch is not None:
+            self._watch.close()
         if self._mesh is not None:
             self._mesh.close()
 

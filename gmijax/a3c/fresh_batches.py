@@ -9,13 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.a3c.report import MAX_COUNTED, BatchCounts, histogram_of
 from gmijax.channels.batcher import Batcher
 from gmijax.channels.experience import Rollouts
 from gmijax.clock import running_s
 from gmijax.collectives.interface import Communicator
-from gmijax.config import TrainConfig
-from gmijax.decoupled.algorithm import Flow
-from gmijax.decoupled.report import MAX_COUNTED, BatchCounts, histogram_of
+from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import CollectiveTimeout
 from gmijax.supervise.child import ChildLink
 
@@ -43,12 +42,13 @@ class FreshBatches:
     def __init__(
         self,
         config: TrainConfig,
-        flow: Flow,
         receiver: Batcher,
         comm: Communicator,
         link: ChildLink,
     ) -> None:
-        self._config, self._flow = config, flow
+        assert isinstance(config.algo, A3cConfig)
+        self._config, self._algo = config, config.algo
+        self._batch_size = config.algo.batch_of(config.envs_per_gmi)
         self._receiver, self._comm, self._link = receiver, comm, link
         self._passed_over = np.zeros(MAX_COUNTED + 1, np.float32)
 
@@ -75,7 +75,7 @@ class FreshBatches:
         counts = BatchCounts(
             stop, of_all, stale, float(gathered[:, 3].max()), gathered[:, 4:].sum(axis=0)
         )
-        scale = np.float32(self._comm.world_size * self._flow.batch_unrolls / of_all)
+        scale = np.float32(self._comm.world_size * self._batch_size / of_all)
         return FreshBatch(batch.experience, fresh * scale, counts)
 
     def _receive(self, version: int, updates: int) -> tuple[Rollouts, float]:
@@ -86,7 +86,7 @@ class FreshBatches:
         limit_s = times.reduce.timeout_s if updates else times.run.start_timeout_s
         while True:
             try:
-                batch = self._receiver.receive(self._flow.batch_unrolls, _SLICE_S)
+                batch = self._receiver.receive(self._batch_size, _SLICE_S)
             except CollectiveTimeout as error:
                 waited_s = running_s() - since
                 if waited_s > limit_s:
@@ -103,7 +103,7 @@ class FreshBatches:
 
     def _fresh(self, batch: Rollouts, version: int) -> npt.NDArray[np.float32]:
         """[B]: 1 for unrolls within the bound of staleness, 0 for others."""
-        if self._flow.max_staleness is None:
-            return np.ones(self._flow.batch_unrolls, np.float32)
-        fresh = version - batch.versions <= self._flow.max_staleness
+        if self._algo.max_staleness is None:
+            return np.ones(self._batch_size, np.float32)
+        fresh = version - batch.versions <= self._algo.max_staleness
         return fresh.astype(np.float32)

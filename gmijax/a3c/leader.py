@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.a3c.a3c import UpdateResult
+from gmijax.a3c.job_registers import AgentCommand, AgentReport, JobRegisters
+from gmijax.a3c.report import BatchCounts, Reporter
 from gmijax.clock import running_s
 from gmijax.config import TrainConfig
-from gmijax.decoupled.algorithm import UpdateResult, load_decoupled
-from gmijax.decoupled.job_registers import AgentCommand, AgentReport, JobRegisters
-from gmijax.decoupled.report import BatchCounts, Reporter
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout
 from gmijax.learning.checkpoint import (
@@ -26,7 +26,7 @@ from gmijax.learning.checkpoint import (
     save_episodes,
     save_learner,
 )
-from gmijax.learning.learner import LearnerState, policy_figures
+from gmijax.learning.learner import TrainState, policy_figures
 from gmijax.learning.policy_file import save_policy
 from gmijax.learning.start import first_window
 from gmijax.learning.training_log import TrainingLog
@@ -78,7 +78,7 @@ class Leader:
         counts: BatchCounts,
         updated: UpdateResult,
         update_s: float,
-        state: LearnerState,
+        state: TrainState,
     ) -> None:
         """Takes one update, of `update_s` seconds, into the metrics."""
         self.env_steps, self._updates = env_steps, updates
@@ -87,7 +87,7 @@ class Leader:
             self._hear()
             self._write_line(state)
 
-    def checkpoint_now_and_then(self, state: LearnerState) -> None:
+    def checkpoint_now_and_then(self, state: TrainState) -> None:
         """Begins a checkpoint when one is due, finishes one when all agents have done theirs.
 
         Nobody waits: the agents add their environments when they look. Until then no other
@@ -109,7 +109,7 @@ class Leader:
             self._finish_checkpoint()
         self._order(self.env_steps, is_ending=True)
 
-    def finish(self, state: LearnerState) -> None:
+    def finish(self, state: TrainState) -> None:
         """Writes the last checkpoint and the last line of metrics."""
         self._wall_s = time.monotonic() - self._started
         self._begin_checkpoint(state)
@@ -147,7 +147,7 @@ class Leader:
             profile=profile,
         )
 
-    def _write_line(self, state: LearnerState) -> None:
+    def _write_line(self, state: TrainState) -> None:
         self._reporter.write(
             self.env_steps,
             [report for report in self._reports if report is not None],
@@ -168,9 +168,8 @@ class Leader:
         theirs = [None if report is None else report.checkpoint for report in self._reports]
         return [gmi for gmi, has in zip(self.agents, theirs, strict=True) if has != self._pending]
 
-    def _begin_checkpoint(self, state: LearnerState) -> None:
-        learned = load_decoupled(self.config.algo).learned(state)
-        require_finite(learned, self.config.env.label, self.env_steps)
+    def _begin_checkpoint(self, state: TrainState) -> None:
+        require_finite(state.params, self.config.env.label, self.env_steps)
         save_learner(self.link.run, self.env_steps, state)
         save_policy(self.link.run, self.env_steps, self.config.env, self.config.algo, state)
         self._pending = self.env_steps

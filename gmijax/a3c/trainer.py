@@ -14,18 +14,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmijax.a3c.a3c import make_update
+from gmijax.a3c.fresh_batches import FreshBatches
+from gmijax.a3c.job_registers import JobRegisters
+from gmijax.a3c.leader import Leader
+from gmijax.a3c.targets import Unrolls
 from gmijax.channels.batcher import Batcher
 from gmijax.collectives.interface import Communicator
-from gmijax.config import TrainConfig
-from gmijax.decoupled.algorithm import load_decoupled
-from gmijax.decoupled.fresh_batches import FreshBatches
-from gmijax.decoupled.job_registers import JobRegisters
-from gmijax.decoupled.leader import Leader
+from gmijax.config import A3cConfig, TrainConfig
 from gmijax.learning.checkpoint import require_equal
 from gmijax.learning.iteration_trace import IterationTrace
 from gmijax.learning.learner import (
-    LearnerState,
+    TrainState,
     acting_weights,
+    init_learner,
     make_learner,
     pack_weights,
 )
@@ -51,17 +53,17 @@ class Trainer:
     link: ChildLink
 
     def __post_init__(self) -> None:
-        algo, spec, num_envs = self.config.algo, self.env.spec, self.config.envs_per_gmi
-        self._algorithm = load_decoupled(algo)
-        flow = self._algorithm.flow(algo, num_envs)
-        self._batches = FreshBatches(self.config, flow, self.receiver, self.comm, self.link)
-        self._learner = make_learner(spec, algo)
-        self._update = self._algorithm.make_update(self._learner, spec, num_envs, self.comm)
+        assert isinstance(self.config.algo, A3cConfig)
+        self._algo = self.config.algo
+        self._batch_size = self._algo.batch_of(self.config.envs_per_gmi)
+        self._learner = make_learner(self.env.spec, self._algo)
+        self._update = make_update(self._learner, self.comm)
         self._env_steps = 0
         self._updates = 0
         traced = self.config.run.profiled if self.comm.rank == 0 else None
         self._trace = IterationTrace(traced, self.link.run.profile)
         self._version = 0
+        self._batches = FreshBatches(self.config, self.receiver, self.comm, self.link)
 
     def run(self) -> dict[str, Any]:
         """Learns until `num_timesteps` are consumed or the controller asks for an end.
@@ -79,16 +81,17 @@ class Trainer:
         leads = self.comm.rank == 0
         # The same key as synchronous training uses: the same first policy.
         state, self._env_steps = first_state(
-            self._algorithm.init, self._learner, self.env.spec.obs_size, self.config
+            init_learner, self._learner, self.env.spec.obs_size, self.config
         )
         self._version = int(state.iteration)
-        self._update.compile(state)
+        self._update.trace((), state, self._example())
+        self._update.compile()
         pack = jax.jit(lambda state: pack_weights(acting_weights(self._learner, state)))
         first = np.asarray(pack(state))
         compile_s = time.monotonic() - started - self.link.start_s["waiting"]
         self.link.beat("ready", 0)
         # And so all trainers have compiled.
-        require_equal(self.comm, self.link.gmi, self._algorithm.learned(state), self._env_steps)
+        require_equal(self.comm, self.link.gmi, state.params, self._env_steps)
         if not leads:
             return {"status": self._loop(state, None), "updates": self._updates}
         leader = Leader(
@@ -101,19 +104,20 @@ class Trainer:
             leader.close()
         return leader.outcome(status, compile_s, self._trace.outcome()).to_dict()
 
-    def _loop(self, state: LearnerState, leader: Leader | None) -> str:
+    def _loop(self, state: TrainState, leader: Leader | None) -> str:
         """Returns the status for the outcome."""
         while True:
             self._trace.begin(self._updates + 1, self._update.wait)
             batch = self._batches.take(self._version, self._updates)
             counts, started = batch.counts, time.monotonic()
-            state, updated = self._update(state, batch.experience, jnp.asarray(batch.weights))
+            unrolls = Unrolls(**batch.experience)  # pyright: ignore[reportArgumentType]
+            state, _, updated = self._update(state, (unrolls, jnp.asarray(batch.weights)))
             self._update.wait()
             weights = np.asarray(updated.weights)
             updated = jax.device_get(updated._replace(weights=None))
             self._version += 1
             self._updates += 1
-            self._env_steps += round(counts.fresh) * self.config.algo.unroll_length
+            self._env_steps += round(counts.fresh) * self._algo.unroll_length
             where = f"{self.config.env.label}, up to env step {self._env_steps}"
             check_losses(where, updated.losses._asdict())
             is_stopped = counts.stop > 0
@@ -130,10 +134,28 @@ class Trainer:
                 break
         if leader is not None:
             leader.end()
-        require_equal(self.comm, self.link.gmi, self._algorithm.learned(state), self._env_steps)
+        require_equal(self.comm, self.link.gmi, state.params, self._env_steps)
         # Agents that wait for room may go: the order to end is published by now.
         self.receiver.close()
         if leader is not None:
             leader.finish(state)
         self._trace.close()  # Last: a job that is told to end has little time to save.
         return "stopped" if is_stopped else "completed"
+
+    def _example(self) -> tuple[Unrolls, Any]:
+        """Shapes of a batch and its weights."""
+        steps, size, spec = self._algo.unroll_length, self._batch_size, self.env.spec
+
+        def floats(*shape: int) -> Any:
+            return jax.ShapeDtypeStruct(shape, jnp.float32)
+
+        unrolls = Unrolls(
+            state=floats(steps, size, spec.obs_size),
+            action=floats(steps, size, spec.action_size),
+            reward=floats(steps, size),
+            done=jax.ShapeDtypeStruct((steps, size, 2), jnp.bool_),  # pyright: ignore[reportArgumentType]
+            log_prob=floats(steps, size),
+            cut_value=floats(steps, size),
+            bootstrap=floats(1, size, spec.obs_size),
+        )
+        return unrolls, floats(size)

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from jax.flatten_util import ravel_pytree
 
-from gmijax.decoupled.algorithm import UpdateResult
-from gmijax.decoupled.job_registers import AgentReport
+from gmijax.a3c.a3c import A3cLosses, UpdateResult
+from gmijax.a3c.job_registers import AgentReport
 from gmijax.learning.training_log import TrainingLog, UpdateMetrics
 from gmijax.learning.unroll import no_counts
 from gmijax.sim.wrappers import BatchedEnv
@@ -127,9 +127,10 @@ class Reporter:
     def _of_updates(self) -> tuple[dict[str, float], dict[str, float], dict[str, Any]]:
         """Means of the losses, figures of the learning rates, and the rest."""
         updates, update_s, receive_s = zip(*self._updates, strict=True)
-        _, losses, rates, figures = zip(*updates, strict=True)
-        means = _means([one._asdict() for one in losses])
-        means.pop("weight", None)  # 1, over a batch.
+        _, losses, rates, explained = zip(*updates, strict=True)
+        averaged: Any = np.mean(losses, axis=0, dtype=np.float64)
+        means = dict(zip(A3cLosses._fields, map(float, averaged), strict=True))
+        del means["weight"]  # 1, over a batch.
         # As their names say: the mean of the means, the least and the largest of all.
         joined = {
             name: float(getattr(np, name)([one[name] for one in rates])) for name in rates[0]
@@ -138,7 +139,7 @@ class Reporter:
             means,
             joined,
             {
-                **_means(figures),
+                "value/explained_variance": float(np.mean(explained)),
                 "async/updates": len(self._updates),
                 "time/update_s": float(np.mean(update_s)),
                 "time/receive_s": float(np.mean(receive_s)),
@@ -176,10 +177,6 @@ def mean_and_p99(histogram: npt.NDArray[np.floating]) -> tuple[float, float] | N
     behind = np.arange(len(histogram))
     p99 = int(np.searchsorted(np.cumsum(histogram), 0.99 * total - 1e-6))
     return float(histogram @ behind) / total, float(behind[min(p99, len(behind) - 1)])
-
-
-def _means(each: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    return {name: float(np.mean([one[name] for one in each], dtype=float)) for name in each[0]}
 
 
 def _total(reports: Sequence[AgentReport]) -> AgentReport:

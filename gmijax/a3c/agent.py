@@ -1,8 +1,8 @@
 """The role of a serving GMI: simulator and agent in one.
 
 It acts with the newest weights that were published, sends what came of it, and goes on. Trainers
-never make it wait, except for room. Where unrolls are made in several pieces, newer weights are
-taken up within them too: the less old what a policy learns from is, the fewer steps it takes.
+never make it wait, except for room. Newer weights are taken up within unrolls too: the less old
+what a policy learns from is, the fewer steps it takes.
 """
 
 from __future__ import annotations
@@ -10,19 +10,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.a3c.job_registers import AgentCommand, AgentReport, JobRegisters
+from gmijax.a3c.rollout import UnrollPrograms, num_counts
+from gmijax.a3c.targets import Unrolls
 from gmijax.channels.sender import Sender
 from gmijax.clock import running_s
-from gmijax.config import TrainConfig
-from gmijax.decoupled.algorithm import load_decoupled
-from gmijax.decoupled.job_registers import AgentCommand, AgentReport, JobRegisters
-from gmijax.decoupled.unrolls import UnrollPrograms, num_counts
+from gmijax.config import A3cConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout, PipeClosed
 from gmijax.learning.checkpoint import save_envs
@@ -48,7 +47,7 @@ _SLICE_S = 0.5
 class _PendingRollout(NamedTuple):
     """An unroll that is being computed: what it will be, and the first policy that makes it."""
 
-    experience: Any
+    experience: Unrolls
     stats: Array
     version: int
 
@@ -66,10 +65,9 @@ class Agent:
     link: ChildLink
 
     def __post_init__(self) -> None:
-        algo = self.config.algo
-        self._algorithm = load_decoupled(algo)
-        self._flow = self._algorithm.flow(algo, self.config.envs_per_gmi)
-        self._learner = make_learner(self.env.spec, algo)
+        assert isinstance(self.config.algo, A3cConfig)
+        self._algo = self.config.algo
+        self._learner = make_learner(self.env.spec, self._algo)
         self._report = AgentReport.of_nothing(num_counts(self.env))
         self._orders_seen = 0
         self._orders = AgentCommand(None, is_ending=False)
@@ -95,11 +93,10 @@ class Agent:
         start = jax.jit(lambda key: acting_weights(learner, init_learner(learner, obs_size, key)))
         weights = start(jax.random.key(0))
         env_state = first_envs(self.env, self.config, self.index, gmi=self.link.gmi)
-        algorithm, num_pieces = self._algorithm, self._flow.pieces
-        num_steps = self.config.algo.unroll_length // num_pieces
-        collect = partial(algorithm.collect, self.env, learner.networks, num_steps)
+        num_pieces = self._algo.pieces_per_unroll
+        num_steps = self._algo.unroll_length // num_pieces
         program = UnrollPrograms(
-            *(self.env, collect, algorithm.join, num_pieces, weights, env_state),
+            *(self.env, self._learner.networks, num_steps, num_pieces, weights, env_state),
             stays=self.sender.on_device,
         )
         compile_s = time.monotonic() - started - self.link.start_s["waiting"]
@@ -135,8 +132,8 @@ class Agent:
         while not self._obey(env_state):
             weights = self._newest(weights, unpack)
             version = self._version  # Of the oldest weights that make this unroll.
-            pieces: list[tuple[Any, Counts]] = []
-            for index in range(self._flow.pieces):
+            pieces: list[tuple[Unrolls, Counts]] = []
+            for index in range(self._algo.pieces_per_unroll):
                 if index > 1:  # One piece runs and one waits: more would act with older weights.
                     jax.block_until_ready(pieces[index - 2])
                 if index > 0:
@@ -221,7 +218,7 @@ class Agent:
         More of them in the channel would only make experience older.
         """
         size = sum(array.nbytes for array in arrays.values())
-        most = (self._flow.max_ahead - 0.5) * size / self.config.channel.capacity_bytes
+        most = (self._algo.max_ahead - 0.5) * size / self.config.channel.capacity_bytes
         deadline_s = time.monotonic() + _SLICE_S
         while self.sender.least_occupancy() > most:
             costs, now_s = _is_idle(env_state), time.monotonic()

@@ -1,0 +1,112 @@
+"""How the leader of a node sees whether other nodes live while devices wait for each other.
+
+A device that waits in a ring for a GPU of another node says nothing. So leaders have a connection
+of their own with each other, and send a byte five times a second while they wait for anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Final
+
+from gmijax.clock import running_s
+from gmijax.collectives.nodes.rendezvous import Sockets
+from gmijax.collectives.waits import wait_until
+from gmijax.errors import CollectiveTimeout, PeerLost
+
+_WAITS: Final = b"."
+_IS_THROUGH: Final = b"!"
+_READ_BYTES: Final = 4096
+
+
+class LeaderWatch:
+    """One leader's view of the others; they make the same calls of `meet`.
+
+    Args:
+      sockets: with the other nodes; not blocking.
+      node: position of this one.
+      ids: of the leaders, in order of nodes, for messages.
+    """
+
+    def __init__(self, sockets: Sockets, node: int, ids: Sequence[int]) -> None:
+        self._sockets, self._node, self._ids = sockets, node, ids
+        self._heard_s = dict.fromkeys(sockets, running_s())
+        self._met = dict.fromkeys(sockets, 0)
+        self._num_meetings = 0
+        self._gone: set[int] = set()
+
+    def beat(self) -> None:
+        """Tells the others that this node waits, and hears what they tell."""
+        self._send(_WAITS)
+        self._hear()
+
+    def look(self, since_s: float, timeout_s: float, operation: str, step: int) -> None:
+        """`beat`, and an error if another node is gone, or silent since `since_s` for too long.
+
+        Raises:
+          PeerLost: a leader has hung up before it came to the next meeting.
+          CollectiveTimeout: nothing was heard of a node for `timeout_s`.
+        """
+        self.beat()
+        late = [node for node in self._sockets if self._met[node] <= self._num_meetings]
+        own = self._ids[self._node]
+        if gone := [node for node in late if node in self._gone]:
+            raise PeerLost(own, self._ids[gone[0]], f"{operation} of several nodes", step)
+        limit_s = running_s() - timeout_s
+        if silent := [n for n in late if max(self._heard_s[n], since_s) <= limit_s]:
+            missing = tuple(self._ids[node] for node in silent)
+            raise CollectiveTimeout(own, missing, f"{operation} of several nodes", step, timeout_s)
+
+    def meet(
+        self, timeout_s: float, operation: str, step: int, on_wait: Callable[[], None]
+    ) -> None:
+        """Waits for the other leaders to come here; time only counts while one is silent.
+
+        Args:
+          timeout_s: longest silence.
+          operation: for messages.
+          step: the same.
+          on_wait: called five times a second.
+
+        Raises:
+          PeerLost, CollectiveTimeout: see `look`.
+        """
+        self._send(_IS_THROUGH)
+        since_s = running_s()
+
+        def all_met() -> bool | None:
+            self._hear()
+            return min(self._met.values()) > self._num_meetings or None
+
+        def check() -> None:
+            on_wait()
+            self.look(since_s, timeout_s, operation, step)
+
+        wait_until(all_met, check, float("inf"))
+        self._num_meetings += 1
+
+    def close(self) -> None:
+        """Hangs up."""
+        for connection in self._sockets.values():
+            connection.close()
+
+    def _send(self, told: bytes) -> None:
+        for connection in self._sockets.values():
+            # It is gone, which is for `look` to say, or has not read what was sent for hours.
+            with suppress(OSError):
+                connection.send(told)
+
+    def _hear(self) -> None:
+        for node, connection in self._sockets.items():
+            try:
+                told = connection.recv(_READ_BYTES)
+            except BlockingIOError:
+                continue
+            except OSError:
+                told = b""
+            if told:
+                self._heard_s[node] = running_s()
+                self._met[node] += told.count(_IS_THROUGH)
+            else:
+                self._gone.add(node)
