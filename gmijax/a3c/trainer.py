@@ -110,7 +110,7 @@ class Trainer:
             self._trace.begin(self._updates + 1, self._update.wait)
             batch = self._batches.take(self._version, self._updates)
             counts, started = batch.counts, time.monotonic()
-            unrolls = Unrolls(**batch.experience)  # pyright: ignore[reportArgumentType]
+            unrolls = Unrolls(**batch.experience)
             state, _, updated = self._update(state, (unrolls, jnp.asarray(batch.weights)))
             self._update.wait()
             weights = np.asarray(updated.weights)
