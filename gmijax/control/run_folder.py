@@ -128,5 +128,5 @@ def what_is_left(run: RunPaths) -> str:
     if checkpoints_of(run.root):
         return f"continue: gmijax train run.dir={shlex.quote(nearby(run.root))} run.resume=auto"
     if not read_metrics(run.metrics):
-        return "training had not begun, so there is no checkpoint"
+        return "there is no checkpoint"
     return "there is no checkpoint: run.stop_timeout_s is the time that GMIs get to save one"
