@@ -27,7 +27,7 @@ CASES = [
     Case(Layout(((0,),)), 1000, None, 0),
     Case(Layout(((0, 1),)), 17, signal.SIGSTOP, 1),
     Case(Layout(((0,), (1,))), 100_003, signal.SIGKILL, 0),
-    Case(Layout(((0, 1), (2, 3))), 4099, signal.SIGSTOP, 0),
+    Case(Layout(((0, 1), (2, 3))), 4099, signal.SIGKILL, 0),
     Case(Layout(((0, 1, 2), (3, 4, 5))), 100_003, signal.SIGKILL, 4),
     Case(Layout(((0, 1), (2,))), 1, signal.SIGKILL, 2),
     Case(Layout(((0, 1), (2, 3)), 2), 4099, None, 0),

@@ -19,6 +19,13 @@ from gmijax.types import Array
 Options = dict[str, Any]
 
 
+def zeros(size: int) -> Array:
+    """Zeros [size] on the device, without a program that makes them."""
+    import jax
+
+    return jax.device_put(np.zeros(size, np.float32))
+
+
 @functools.cache
 def mean_of(comm: Communicator, size: int) -> Callable[[FloatBuffer], FloatBuffer]:
     """A function that takes the mean of buffers [size] in a program, compiled once."""
@@ -30,12 +37,11 @@ def mean_of(comm: Communicator, size: int) -> Callable[[FloatBuffer], FloatBuffe
         return collectives.mean(own), own, ()
 
     program = comm.program(step)
-    zeros = jax.numpy.zeros(size)
-    program.trace((), zeros, zeros)
+    program.trace((), zeros(size), zeros(size))
     program.compile()
 
     def call(buffer: FloatBuffer) -> FloatBuffer:
-        mean, _, _ = program(jax.numpy.zeros(size), jax.device_put(buffer))
+        mean, _, _ = program(zeros(size), jax.device_put(buffer))
         program.wait()
         return np.asarray(mean)
 
@@ -81,18 +87,16 @@ def several_means(comm: Communicator, size: int) -> TracedStep:
         return jax.lax.fori_loop(0, 5, add_mean_rank, shared), own + 1.0, ranks
 
     program = comm.program(step)
-    program.trace((), jnp.zeros(size), jnp.zeros(3))
+    program.trace((), zeros(size), zeros(3))
     program.compile()
     return program
 
 
 def check_steps(comm: Communicator, options: Options) -> Options:
     """Means and values of all ranks from within a program, between calls from outside it."""
-    import jax.numpy as jnp
-
     size, middle = options["num_floats"], (comm.world_size - 1) / 2
     program = several_means(comm, size)
-    shared, own = jnp.zeros(size), jnp.zeros(3)
+    shared, own = zeros(size), zeros(3)
     for call in range(1, 21):
         shared, own, ranks = program(shared, own)
         if call % 4 == 0:
@@ -180,7 +184,7 @@ def step_forever(comm: Communicator, options: Options) -> Options:
         return shared + collectives.mean(own[0]), own, jnp.sum(shared)
 
     program = comm.program(step)
-    shared, own = jnp.zeros(64), jnp.eye(64)
+    shared, own = zeros(64), jax.device_put(np.eye(64, dtype=np.float32))
     program.trace((), shared, own)
     program.compile()
     pauses = np.random.default_rng(comm.rank)

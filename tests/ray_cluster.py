@@ -59,9 +59,3 @@ def two_nodes(log: Path, gpus: Sequence[int] = ()) -> Iterator[Cluster]:
     ):
         yield Cluster(process, log)
         process.communicate(timeout=120)
-
-
-def events(run: Path, event: str) -> list[dict[str, Any]]:
-    path = run / "events.jsonl"
-    lines = path.read_text().splitlines() if path.exists() else []
-    return [found for line in lines if (found := json.loads(line))["event"] == event]

@@ -34,11 +34,12 @@ class Neighbours:
         assert done.returncode == 0, done.stderr
         return self.lines("alone", 0)
 
-    def beside_a_killed_job(self) -> tuple[list[str], list[dict[str, Any]]]:
-        """States of four jobs of which the third is killed, and the lines of the first."""
-        command = (*self._overrides, "seed=0,1,2,3", "run.dir=killed")
+    def beside_a_killed_job(self, num_jobs: int) -> tuple[list[str], list[dict[str, Any]]]:
+        """States of jobs of which the second is killed, and the lines of the first."""
+        seeds = ",".join(map(str, range(num_jobs)))
+        command = (*self._overrides, f"seed={seeds}", "run.dir=killed")
         sweep = start(*command, cwd=self._folder, command="sweep")
-        victim = self._folder / "killed" / "002"
+        victim = self._folder / "killed" / "001"
 
         def pid() -> int | None:
             trains = sweep.poll() is None and len(read_metrics(victim / "metrics.jsonl")) > 2

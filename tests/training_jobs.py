@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
@@ -143,6 +144,13 @@ def iteration_of(run: Path, gmi: int) -> int:
     """Iterations that a GMI says it has done."""
     beat = heartbeat_of(run, gmi)
     return 0 if beat is None else beat.iteration
+
+
+def events(run: Path, event: str) -> list[dict[str, Any]]:
+    """Events of this kind of a run, in order."""
+    path = run / "events.jsonl"
+    lines = path.read_text().splitlines() if path.exists() else []
+    return [found for line in lines if (found := json.loads(line))["event"] == event]
 
 
 def pids_of(run: Path) -> list[int]:

@@ -13,19 +13,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpy.typing as npt
 
 from gmijax.a3c.a3c import make_update
+from gmijax.a3c.fresh_batches import FreshBatches
 from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.leader import Leader
-from gmijax.a3c.report import MAX_COUNTED, BatchCounts, histogram_of
 from gmijax.a3c.targets import Unrolls
 from gmijax.channels.batcher import Batcher
-from gmijax.channels.experience import Rollouts
-from gmijax.clock import running_s
 from gmijax.collectives.interface import Communicator
 from gmijax.config import A3cConfig, TrainConfig
-from gmijax.errors import CollectiveTimeout
 from gmijax.learning.checkpoint import require_equal
 from gmijax.learning.iteration_trace import IterationTrace
 from gmijax.learning.learner import (
@@ -39,9 +35,6 @@ from gmijax.learning.physics_health import check_losses
 from gmijax.learning.start import first_state
 from gmijax.sim.wrappers import BatchedEnv
 from gmijax.supervise.child import ChildLink
-
-_SLICE_S = 0.5
-"""Longest wait for experience before the trainer says that it is alive."""
 
 
 @dataclass
@@ -70,7 +63,7 @@ class Trainer:
         traced, leads = self.config.run.profiled, self.comm.rank == 0
         self._trace = IterationTrace(traced, self.link.run.profile, is_written=leads)
         self._version = 0
-        self._passed_over = np.zeros(MAX_COUNTED + 1, np.float32)
+        self._batches = FreshBatches(self.config, self.receiver, self.comm, self.link)
 
     def run(self) -> dict[str, Any]:
         """Learns until `num_timesteps` are consumed or the controller asks for an end.
@@ -115,12 +108,10 @@ class Trainer:
         """Returns the status for the outcome."""
         while True:
             self._trace.begin(self._updates + 1, self._update.wait)
-            batch, waited_s = self._receive()
-            counts = self._meet(batch, waited_s)
-            started = time.monotonic()
-            unrolls = Unrolls(**batch.experience)  # pyright: ignore[reportArgumentType]
-            weight = jnp.asarray(self._weights_of(batch) * self._scale(counts))
-            state, _, updated = self._update(state, (unrolls, weight))
+            batch = self._batches.take(self._version, self._updates)
+            counts, started = batch.counts, time.monotonic()
+            unrolls = Unrolls(**batch.experience)
+            state, _, updated = self._update(state, (unrolls, jnp.asarray(batch.weights)))
             self._update.wait()
             weights = np.asarray(updated.weights)
             updated = jax.device_get(updated._replace(weights=None))
@@ -150,53 +141,6 @@ class Trainer:
             leader.finish(state)
         self._trace.close()  # Last: a job that is told to end has little time to save.
         return "stopped" if is_stopped else "completed"
-
-    def _receive(self) -> tuple[Rollouts, float]:
-        """The next batch with at least one unroll that is fresh enough, and the wait for it."""
-        started, since = time.monotonic(), running_s()
-        # At first the agents may still compile.
-        times = self.config
-        limit_s = times.reduce.timeout_s if self._updates else times.run.start_timeout_s
-        while True:
-            try:
-                batch = self.receiver.receive(self._batch_size, _SLICE_S)
-            except CollectiveTimeout as error:
-                waited_s = running_s() - since
-                if waited_s > limit_s:
-                    raise CollectiveTimeout(
-                        self.link.gmi, error.missing, "receive", self._updates, limit_s
-                    ) from None
-            else:
-                if self._weights_of(batch).any():
-                    return batch, time.monotonic() - started
-                self._passed_over += histogram_of(self._version - batch.versions)
-                since = running_s()
-            if self._updates:
-                self.link.beat("running", self._updates)
-
-    def _weights_of(self, batch: Rollouts) -> npt.NDArray[np.float32]:
-        """[B]: 1 for unrolls within the bound of staleness, 0 for others."""
-        if self._algo.max_staleness is None:
-            return np.ones(self._batch_size, np.float32)
-        fresh = self._version - batch.versions <= self._algo.max_staleness
-        return fresh.astype(np.float32)
-
-    def _scale(self, counts: BatchCounts) -> np.float32:
-        """Weight of a fresh unroll, equal to that of any other of the job."""
-        return np.float32(self.comm.world_size * self._batch_size / counts.fresh)
-
-    def _meet(self, batch: Rollouts, waited_s: float) -> BatchCounts:
-        """Tells the other trainers of this batch, and hears of theirs."""
-        fresh = float(self._weights_of(batch).sum())
-        behind = histogram_of(self._version - batch.versions) + self._passed_over
-        self._passed_over[:] = 0.0
-        head = [self.link.stop_requested, fresh, float(behind.sum()) - fresh, waited_s]
-        mine = np.concatenate([head, behind])
-        gathered = self.comm.all_gather(mine.astype(np.float32))
-        stop, fresh, stale, _ = (float(x) for x in gathered[:, :4].sum(axis=0))
-        return BatchCounts(
-            stop, fresh, stale, float(gathered[:, 3].max()), gathered[:, 4:].sum(axis=0)
-        )
 
     def _example(self) -> tuple[Unrolls, Any]:
         """Shapes of a batch and its weights."""

@@ -25,10 +25,10 @@ from gmijax.errors import CollectiveError, GmijaxError, PeerLost, PipeClosed
 
 DATA, GOODBYE, RELEASED = 1, 2, 3
 
-_HEADER: Final = struct.Struct("<QQ")
+HEADER: Final = struct.Struct("<QQ")
 """The first part of every message: its kind, and a sequence number."""
 
-_FAREWELL_S: Final = 5.0
+FAREWELL_S: Final = 5.0
 """How long an agent that closes waits for a trainer that is not there yet, or takes nothing."""
 
 
@@ -50,7 +50,7 @@ class _End:
 
     def _tell(self, kind: int, sequence: int) -> None:
         """Sends a message without parts, if there is somebody who could want it."""
-        self._connection.send([_HEADER.pack(kind, sequence)])
+        self._connection.send([HEADER.pack(kind, sequence)])
 
     def _why_ended(self, operation: str, step: int) -> GmijaxError | None:
         """Why nothing comes any more; None as long as something may."""
@@ -64,7 +64,7 @@ class _End:
         if (found := self._connection.try_receive()) is None:
             return None
         head = found[0].tobytes() if found else b""
-        kind, sequence = _HEADER.unpack(head) if len(head) == _HEADER.size else (0, 0)
+        kind, sequence = HEADER.unpack(head) if len(head) == HEADER.size else (0, 0)
         if kind not in (DATA, GOODBYE, RELEASED):
             # Only who has the secret could send it.
             raise CollectiveError(
@@ -88,10 +88,12 @@ class RemoteWriter(_End):
         peer: int,
         capacity_bytes: int,
         secret: bytes,
+        farewell_s: float = FAREWELL_S,
     ) -> None:
         super().__init__(
-            Connection(address, rank, peer, _HEADER.size, listens=False, secret=secret)
+            Connection(address, rank, peer, HEADER.size, listens=False, secret=secret)
         )
+        self._farewell_s = farewell_s
         self.max_message_bytes = capacity_bytes // 2
         self._capacity_bytes = capacity_bytes
         self._released = self._on_the_way = 0
@@ -118,7 +120,7 @@ class RemoteWriter(_End):
     def commit(self) -> None:
         """See `PipeWriter`."""
         parts, self._reserved = self._reserved, []
-        self._connection.send([_HEADER.pack(DATA, self._sequence), *parts])
+        self._connection.send([HEADER.pack(DATA, self._sequence), *parts])
         self._lengths.append(message_bytes([part.size for part in parts]))
         self._on_the_way += self._lengths[-1]
         self._sequence += 1
@@ -147,7 +149,7 @@ class RemoteWriter(_End):
         left = deadline_s = math.inf
         while (load := self.load_bytes()) and not self._has_left and not self._connection.is_cut():
             if load < left:
-                left, deadline_s = load, running_s() + _FAREWELL_S
+                left, deadline_s = load, running_s() + self._farewell_s
             elif running_s() > deadline_s:
                 break
             time.sleep(1e-3)
@@ -171,7 +173,7 @@ class RemoteReader(_End):
         capacity_bytes: int,
         secret: bytes,
     ) -> None:
-        longest = capacity_bytes // 2 + _HEADER.size
+        longest = capacity_bytes // 2 + HEADER.size
         super().__init__(Connection(address, rank, peer, longest, listens=True, secret=secret))
         self._is_held = False
 

@@ -61,12 +61,17 @@ def trained_policy(checkpoint: Path, spec: EnvSpec, *, deterministic: bool) -> A
     state = saved_state(checkpoint, learner, spec.obs_size)
     weights = state.params, acting_moments(learner.config, state)
     sha = digest(weights).astype("uint16").tobytes().hex()
-    return ActingPolicy(_trained(learner, deterministic), weights, sha)
+    return ActingPolicy(policy_of(learner, deterministic=deterministic), weights, sha)
 
 
-def _trained(
-    learner: Learner, deterministic: bool
+def policy_of(
+    learner: Learner, *, deterministic: bool
 ) -> Callable[[PyTree, Array, PRNGKey], tuple[Array, Array]]:
+    """A function `(weights, obs, keys) -> (action, log density)`, see `ActingPolicy`.
+
+    Without noise, if it is deterministic, and then with a density of 0.
+    """
+
     def choose(weights: PyTree, obs: Array, keys: PRNGKey) -> tuple[Array, Array]:
         params, moments = weights
         output = networks.output(params, normalize(moments, obs))

@@ -195,7 +195,8 @@ class ProgramStep:
         self._all_reduce, self._transport = all_reduce, transport
         self._donated = (2, 3) if donates_own else (2,)
         self._step = step
-        self._rank = jnp.asarray(0 if all_reduce is None else all_reduce.rank, jnp.int32)
+        # Put there, not computed: that would be a program of its own.
+        self._rank = jax.device_put(np.int32(0 if all_reduce is None else all_reduce.rank))
         self._program: Any = None
         self._constants: Any = None
         self._last: Any = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import PurePath
@@ -141,6 +142,15 @@ class EnvConfig(KeyGroup):
     def label(self) -> str:
         """Name of the task in files and messages: `ant`, `go1`, `brax/ant`, `cart.py:make`."""
         return label_of(self.suite, str(self.name))
+
+    @property
+    def words(self) -> str:
+        """What chooses the task on a command line: `env=ant`, `env=brax env.name=ant`."""
+        name = str(self.name)
+        if self.suite == "custom":
+            return f"env={shlex.quote(name)}"
+        choice = choice_of(self.suite, name)
+        return f"env={choice}" if choice == name else f"env={choice} env.name={shlex.quote(name)}"
 
     @property
     def slug(self) -> str:

@@ -179,7 +179,7 @@ class _TrainingJob:
         with (
             followed(config, run, start_point.checkpoint, self._console.print),
             filmed(self._opengl, run, self._console.print),
-            recorded(run, partial(what_is_left, run), record),
+            recorded(run, partial(what_is_left, config, run), record),
         ):
             self._prepare(start_point)
             with progress:

@@ -121,12 +121,15 @@ def record_end(
         draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
 
 
-def what_is_left(run: RunPaths) -> str:
+def what_is_left(config: TrainConfig, run: RunPaths) -> str:
     """Says how an interrupted job can be continued."""
     if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
         return f"training was complete: {nearby(run.root)}"
     if checkpoints_of(run.root):
-        return f"continue: gmijax train run.dir={shlex.quote(nearby(run.root))} run.resume=auto"
+        # Task and algorithm are those of the command: without them the defaults are compared.
+        job = f"{config.env.words} algo={config.algo.name}"
+        folder = shlex.quote(nearby(run.root))
+        return f"continue: gmijax train {job} run.dir={folder} run.resume=auto"
     if not read_metrics(run.metrics):
-        return "training had not begun, so there is no checkpoint"
+        return "there is no checkpoint"
     return "there is no checkpoint: run.stop_timeout_s is the time that GMIs get to save one"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-
 from gmijax.autotune.tuner import Search, SearchResult, is_auto, workload_of
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
@@ -51,12 +49,8 @@ def search(config: TrainConfig, *, show: Show = False) -> SearchResult:
 
 def _training(config: TrainConfig, result: SearchResult) -> str:
     """The command that trains with what was found, beside what else was given."""
-    env = config.env
-    task = f"env={shlex.quote(env.label)}"
-    if env.label == f"{env.suite}/{env.name}":
-        task = f"env={env.suite} env.name={env.name}"
     gpus = "" if config.plan.gpus == 1 else f" plan.gpus={config.plan.num_gpus}"
     return (
-        f"gmijax train {task} num_envs={result.num_envs} "
+        f"gmijax train {config.env.words} num_envs={result.num_envs} "
         f"plan.gmis_per_gpu={result.gmis_per_gpu} physics.impl={result.impl}{gpus}"
     )

@@ -115,7 +115,7 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     if config.checkpoint != SHIPPED and (note := _return_while_training(config, returns)):
         console.print(note)
     if "walking" in returns:
-        console.print(_walking(config, returns["walking"]))
+        console.print(walking_lines(config, returns["walking"]))
     console.print(f"returns: {nearby(paths.returns)}")
     if not paths.model.exists():
         without_film(config, returns["env"], console)
@@ -132,7 +132,8 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     print_next(console, *_next_steps(config, returns["env"]))
 
 
-def _walking(config: PlayConfig, walk: Mapping[str, Any] | None) -> str:
+def walking_lines(config: PlayConfig, walk: Mapping[str, Any] | None) -> str:
+    """What is said of a walking test: its results, or why there was none."""
     if walk is not None:
         return "\n".join(lines_of(walk))
     if config.walking_envs == 0:

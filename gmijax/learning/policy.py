@@ -123,7 +123,11 @@ class ActorCritic(NamedTuple):
         return ActorCriticParams(
             policy=self.policy.init(policy_key, obs[:, : self.actor_obs_size]),
             value=self.value.init(value_key, obs[:, : self.value_obs_size]) if self.value else {},
-            log_std=jnp.full((self.distribution.action_size,), jnp.log(self.init_noise_std)),
+            # With its dtype said: of a weak type, as of a number of Python, whatever is compiled
+            # for the first state would be compiled again for the second.
+            log_std=jnp.full(
+                (self.distribution.action_size,), jnp.log(self.init_noise_std), jnp.float32
+            ),
         )
 
     def with_inputs(

@@ -9,7 +9,7 @@ from typing import Any
 
 from gmijax.clock import wait_for
 
-_LAST_LINE_S = 2.0
+LAST_LINE_S = 2.0
 """Longest wait for a report when training ends, however it ends."""
 
 
@@ -24,8 +24,8 @@ class ReportThread:
       report: the function; used by the thread only, until `stop`.
     """
 
-    def __init__(self, report: Callable[..., None]) -> None:
-        self._report = report
+    def __init__(self, report: Callable[..., None], last_line_s: float = LAST_LINE_S) -> None:
+        self._report, self._last_line_s = report, last_line_s
         self._queue: SimpleQueue[tuple[Any, ...] | None] = SimpleQueue()
         self._is_idle = threading.Event()
         self._is_idle.set()
@@ -56,7 +56,7 @@ class ReportThread:
 
     def stop(self) -> None:
         """Ends the thread, which may finish a call. Idempotent."""
-        wait_for(self._is_idle.wait, _LAST_LINE_S)
+        wait_for(self._is_idle.wait, self._last_line_s)
         self._queue.put(None)
 
     def _run(self) -> None:

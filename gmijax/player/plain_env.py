@@ -188,7 +188,8 @@ def _plain_task(config: EnvConfig) -> Env:
     if config.suite != "gmijax":
         allowed = ", ".join(TASKS)
         raise ConfigError(
-            f"env={config.label}: only our own tasks are played without jax; allowed are {allowed}"
+            f"env={config.label}: only our own tasks are played without jax: {allowed}; "
+            "gmijax play films others"
         )
     require_env(config)
     module = importlib.import_module(TASKS[str(config.name)])

@@ -75,34 +75,44 @@ class Stage:
         self._mujoco.mj_fwdPosition(self._model, self._data)
         self._renderer.update_scene(self._data, self._view)
         if command.size and (robot := free_robot(self._model)) is not None:
-            self._show_command(robot, command)
+            show_command(self._renderer.scene, self._model, self._data, robot, command)
         return self._renderer.render()
 
-    def _show_command(self, robot: int, command: npt.NDArray[Any]) -> None:
-        """Arrows above a robot, 0.5 m for 1 m/s or 1 rad/s: where to, and upwards a left turn.
 
-        `command` [3] is in m/s forwards and to the left, and rad/s.
-        """
-        model, data = self._model, self._data
-        own = model.body_rootid[model.geom_bodyid] == model.body_rootid[robot]
-        top = data.geom_xpos[own, 2].max(initial=data.xpos[robot, 2]) + _ABOVE_M
-        start = np.array([*data.xpos[robot, :2], top])
-        ahead = data.xmat[robot].reshape(3, 3)[:2, 0]
-        forwards = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
-        left = np.array([-forwards[1], forwards[0]])
-        way = [*(command[0] * forwards + command[1] * left), 0.0]
-        self._arrow(start, np.array(way), _WAY)
-        self._arrow(start, np.array([0.0, 0.0, command[2]]), _TURN)
+def show_command(scene: Any, model: Any, data: Any, robot: int, command: npt.NDArray[Any]) -> None:
+    """Adds arrows to a scene, above a robot, 0.5 m for 1 m/s or 1 rad/s.
 
-    def _arrow(self, start: npt.NDArray[Any], speed: npt.NDArray[Any], colour: Any) -> None:
-        scene, arrow = self._renderer.scene, self._mujoco.mjtGeom.mjGEOM_ARROW
-        if scene.ngeom == scene.maxgeom or np.linalg.norm(speed) < _LEAST_SPEED:
-            return
-        geom = scene.geoms[scene.ngeom]
-        nothing = np.zeros(3)
-        self._mujoco.mjv_initGeom(geom, arrow, nothing, nothing, np.zeros(9), np.float32(colour))
-        self._mujoco.mjv_connector(geom, arrow, _ARROW_M, start, start + _M_PER_SPEED * speed)
-        scene.ngeom += 1
+    They show where to, and upwards a left turn.
+
+    Args:
+      scene: the `mujoco.MjvScene`.
+      model: the `mujoco.MjModel`.
+      data: its `mujoco.MjData`, with the poses of bodies.
+      robot: a body.
+      command: [3], m/s forwards and to the left, rad/s.
+    """
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[robot]
+    top = data.geom_xpos[own, 2].max(initial=data.xpos[robot, 2]) + _ABOVE_M
+    start = np.array([*data.xpos[robot, :2], top])
+    ahead = data.xmat[robot].reshape(3, 3)[:2, 0]
+    forwards = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
+    left = np.array([-forwards[1], forwards[0]])
+    way = [*(command[0] * forwards + command[1] * left), 0.0]
+    _arrow(scene, start, np.array(way), _WAY)
+    _arrow(scene, start, np.array([0.0, 0.0, command[2]]), _TURN)
+
+
+def _arrow(scene: Any, start: npt.NDArray[Any], speed: npt.NDArray[Any], colour: Any) -> None:
+    import mujoco
+
+    arrow = mujoco.mjtGeom.mjGEOM_ARROW
+    if scene.ngeom == scene.maxgeom or np.linalg.norm(speed) < _LEAST_SPEED:
+        return
+    geom = scene.geoms[scene.ngeom]
+    nothing = np.zeros(3)
+    mujoco.mjv_initGeom(geom, arrow, nothing, nothing, np.zeros(9), np.float32(colour))
+    mujoco.mjv_connector(geom, arrow, _ARROW_M, start, start + _M_PER_SPEED * speed)
+    scene.ngeom += 1
 
 
 def body_poses(

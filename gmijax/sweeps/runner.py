@@ -110,18 +110,22 @@ def _run(
     wrong = report.end("failed" if failed else "completed")
     job_events.end(report.data)
     print_outcome(console, report.data, work.ranking, paths, view.line(), work.hint(report.data))
-    _require_success(failed, len(jobs), wrong)
+    _require_success(failed, len(jobs), wrong, paths)
     if ranking := report.data["ranking"]:
         print_next(console, work.next_step(paths, ranking[0]))
     return SweepResult(paths.root, report.data)
 
 
-def _require_success(failed: Sequence[J], num_jobs: int, wrong: str | None) -> None:
+def _require_success(
+    failed: Sequence[J], num_jobs: int, wrong: str | None, paths: SweepPaths
+) -> None:
     """Raises SweepFailed for jobs that have failed, and for what else is `wrong`."""
     if failed:
         first = failed[0]
+        log = paths.log(first.number)
         text = f"{len(failed)} of {num_jobs} jobs failed; job {first.number}: "
-        wrong = f"{text}{first.progress.error}{'' if wrong is None else f'; {wrong}'}"
+        text += f"{first.progress.error}{f' (log: {nearby(log)})' if log.exists() else ''}"
+        wrong = text if wrong is None else f"{text}; {wrong}"
     if wrong is not None:
         raise SweepFailed(wrong)
 

@@ -20,12 +20,11 @@ from fault_trials import kinds_here, run_trial
 SEEDS = (0, *map(int, filter(None, os.environ.get("GMIJAX_FAULT_SEEDS", "").split(","))))
 QUICK: tuple[Trial, ...] = (
     place_faults(
-        ("stdout_gone", "slow", "kill_named", "raise_part", "checkpoint_copies", "term_all"),
+        ("stdout_gone", "slow", "kill_named", "checkpoint_copies", "term_all"),
         random.Random(0),
     ),
     place_faults(("stdout_closed", "stop", "nan", "disk_full"), random.Random(0)),
     Case("train_move", 0),
-    Case("sweep_kill_job", 0),
     *(Case(kind, 0) for kind in ("edit_config_resume", "edit_meta_resume", "edit_summary_again")),
 )
 DECKS = tuple(trial for seed in SEEDS for trial in draw_trials(seed, len(ALL_KINDS), ALL_KINDS))

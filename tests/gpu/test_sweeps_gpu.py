@@ -25,8 +25,8 @@ def test_jobs_do_as_alone_beside_one_that_is_killed_and_one_out_of_memory(
     one = Neighbours(tmp_path, *TASK, "num_envs=256")
     alone = one.alone()
     assert len(alone) == 40
-    states, lines = one.beside_a_killed_job()
-    assert states == ["completed", "completed", "failed", "completed"]
+    states, lines = one.beside_a_killed_job(4)
+    assert states == ["completed", "failed", "completed", "completed"]
     assert lines == alone
     states, lines = neighbours.beside_others("seed=0,1", f"num_envs=256,{TOO_MANY}")
     assert states == ["completed", "failed"] * 2

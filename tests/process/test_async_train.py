@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 from collections.abc import Iterable
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_lines import run as run_here
+from traced_profile import PROFILED, check_profile
 from training_jobs import (
     FOREVER,
     POINT,
@@ -46,13 +48,15 @@ def _read(path: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def two_and_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two agents and two trainers, 150 updates."""
+    """Two agents and two trainers, 150 updates, of which two are traced."""
     cwd = tmp_path_factory.mktemp("async")
     done = train(
         *SMALL, "env.history=2", "plan.serving_gmis_per_gpu=2", "plan.training_gmis_per_gpu=2",
-        f"num_timesteps={150 * 2 * UPDATE}", "run.checkpoint_every=50", "run.dir=run", cwd=cwd,
+        f"num_timesteps={150 * 2 * UPDATE}", "run.checkpoint_every=50", "run.dir=run",
+        "run.profile=2:3", cwd=cwd,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    assert re.search(PROFILED, done.stdout)
     return cwd / "run"
 
 
@@ -88,6 +92,10 @@ def test_what_a_job_leaves_has_the_figures_of_the_paper(two_and_two: Path) -> No
     assert str(checkpoint) == summary["checkpoint"]
     names = sorted(path.name for path in checkpoint.iterdir())
     assert names == ["episodes.json", "gmi_2", "gmi_3", "learner", "meta.json", "policy.npz"]
+
+
+def test_iterations_of_a_trainer_are_traced_for_a_profile(two_and_two: Path) -> None:
+    check_profile(two_and_two)
 
 
 @pytest.mark.timeout(300)

@@ -107,6 +107,7 @@ def test_one_fails_one_hangs_and_a_killed_pack_goes_on(home: Path, python: Path)
     done = train(*line, cwd=home, command="pack")
     assert done.returncode == 1, done.stderr
     assert "4 of 8 jobs failed; job 4: printed nothing for 6 s (pack.stall_s)" in done.stderr
+    assert "all/004/pack/output.log)" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     found = report(folder)
     assert [job["state"] for job in found["jobs"]] == ["completed"] * 4 + ["failed"] * 4

@@ -10,10 +10,11 @@ import signal
 from pathlib import Path
 
 import pytest
-from ray_cluster import RAY, events, two_nodes
+from ray_cluster import RAY, two_nodes
 from training_jobs import (
     POINT,
     STEPS,
+    events,
     kill,
     pids_of,
     require_gone,

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_lines import run as run_here
 from small_disk import can_mount, small_disk
 from sweep_neighbours import Neighbours
 from training_jobs import FOREVER, POINT, STEPS, start, train, wait_until
@@ -22,9 +23,8 @@ SWEEP = (
     *POINT,
     f"num_timesteps={40 * STEPS}",
     "run.checkpoint_every=10",
-    "seed=0,1",
-    # The larger one is infinite in float32, and so is the loss.
-    "algo.entropy_cost=1e-3,1e39",
+    # The second one is infinite in float32, and so is the loss.
+    "algo.entropy_cost=1e-3,1e39,1e-2",
     "sweep.jobs_per_gpu=2",
     "run.dir=all",
 )
@@ -66,19 +66,19 @@ def test_a_sweep_that_is_killed_goes_on_and_a_job_fails_alone(tmp_path: Path) ->
 
     done = train(*SWEEP, cwd=tmp_path, command="sweep", timeout_s=400.0)
     assert done.returncode == 1
-    assert "2 of 4 jobs failed; job 1: " in done.stderr
+    assert "1 of 3 jobs failed; job 1: " in done.stderr
     assert len(done.stderr.splitlines()) == 1
-    assert states(tmp_path) == ["completed", "failed"] * 2
+    assert states(tmp_path) == ["completed", "failed", "completed"]
     assert whole.stat().st_mtime_ns == when  # It was not run again.
     found = report(tmp_path)
     assert sorted(found["ranking"]) == [0, 2]
-    assert found["jobs"][1]["overrides"] == {"seed": "0", "algo.entropy_cost": "1e+39"}
+    assert found["jobs"][1]["overrides"] == {"algo.entropy_cost": "1e+39"}
     assert found["jobs"][0]["wall_s"] > 0.0
     assert table_states(tmp_path) == states(tmp_path)
     assert (tmp_path / "all" / "sweep.png").stat().st_size > 10_000
 
-    other = train(*SWEEP, "seed=0,2", cwd=tmp_path, command="sweep")
-    assert other.returncode == 2
+    other = run_here("sweep", *SWEEP, "seed=0,2", cwd=tmp_path)
+    assert other.code == 2
     assert "holds another sweep; give the same lists, or another folder" in other.stderr
 
 
@@ -173,6 +173,6 @@ def test_jobs_do_as_alone_beside_one_that_is_killed(tmp_path: Path) -> None:
     neighbours = Neighbours(tmp_path, *POINT, f"num_timesteps={400 * STEPS}")
     alone = neighbours.alone()
     assert len(alone) == 400
-    states, lines = neighbours.beside_a_killed_job()
-    assert states == ["completed", "completed", "failed", "completed"]
+    states, lines = neighbours.beside_a_killed_job(2)
+    assert states == ["completed", "failed"]
     assert lines == alone

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import random
 import re
+import shutil
 import signal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from traced_profile import PROFILED, check_profile
 from training_jobs import (
     FOREVER,
     POINT,
     POINT_TASK,
     STEPS,
+    events,
     gmi_pid,
     iteration_of,
     kill,
@@ -112,11 +114,17 @@ def test_two_gmis_compute_what_one_process_with_all_environments_does(two_gmis: 
 
 @pytest.mark.timeout(300)
 def test_a_resumed_run_logs_what_one_that_was_not_stopped_does(tmp_path: Path) -> None:
-    half, whole = f"num_timesteps={12 * STEPS}", f"num_timesteps={24 * STEPS}"
-    for command in ((whole, "run.dir=whole"), (half, "run.dir=parts"), (whole, "run.dir=parts")):
-        resume = ("run.resume=auto",) if "run.dir=parts" in command else ()
-        done = train(*POINT, *command, *resume, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
+    line = (*POINT, f"num_timesteps={24 * STEPS}", "run.checkpoint_every=12")
+    done = train(*line, "run.dir=whole", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    # What it would have left, had it been killed between its last line and its last checkpoint.
+    shutil.copytree(tmp_path / "whole", tmp_path / "parts")
+    shutil.rmtree(tmp_path / "parts" / "checkpoints" / f"{24 * STEPS:012d}")
+    (tmp_path / "parts" / "summary.json").unlink()
+    done = train(*line, "run.dir=parts", "run.resume=auto", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    starts = [event["checkpoint"] for event in events(tmp_path / "parts", "start")]
+    assert starts == [None, str(tmp_path / "parts" / "checkpoints" / f"{12 * STEPS:012d}")]
     one, other = (read_metrics(tmp_path / name / "metrics.jsonl") for name in ("whole", "parts"))
     assert len(one) == len(other) == 24
     for mine, theirs in zip(one, other, strict=True):
@@ -184,13 +192,10 @@ def test_kills_at_any_moment_leave_nothing(plan: tuple[str, ...], tmp_path: Path
     """Also while starting and compiling, GMIs and controller alike."""
     draw = random.Random(plan[0])
     shm, pipes = shared_memory(), mps_directories()
-    for number in range(3):
+    for number in range(2):
         kill_somebody(*plan, cwd=tmp_path / str(number), draw=draw, within_s=(0.3, 7.0))
     require_gone(shared_memory, shm)
     require_gone(mps_directories, pipes)
-
-
-PROFILED = r"profile of iterations 2 to 3: run/profile/\S*/perfetto_trace\.json\.gz\n"
 
 
 def test_iterations_of_the_leader_are_traced_for_a_profile(two_gmis: Path) -> None:
@@ -230,12 +235,3 @@ def test_iterations_of_one_of_two_trainers_are_traced_for_a_profile(
     assert done.returncode == 0, done.stderr
     assert re.search(PROFILED, done.stdout)
     check_profile(tmp_path / "run")
-
-
-def check_profile(run: Path) -> None:
-    """The iterations that were asked for are in the trace, and no others."""
-    [path] = run.glob("profile/plugins/profile/*/perfetto_trace.json.gz")
-    events = json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
-    found = {e["args"]["step_num"] for e in events if e.get("name") == "iteration"}
-    assert found == {"2", "3"}
-    assert _read(run / "summary.json")["profile"]["iterations"] == [2, 3]

@@ -10,9 +10,9 @@ import pytest
 from supervision import save, save_meta
 
 from gmijax.cli.compose import build, compose
-from gmijax.config import PlayConfig
+from gmijax.config import PlayConfig, TrainConfig
 from gmijax.control.films import filmed
-from gmijax.control.run_folder import clear_unfinished, keep_logs
+from gmijax.control.run_folder import clear_unfinished, keep_logs, what_is_left
 from gmijax.control.summary import train_outcome
 from gmijax.deploy.trained_run import open_run
 from gmijax.errors import ConfigError
@@ -104,6 +104,28 @@ def test_a_restart_leaves_alone_what_is_not_its_own(run: RunPaths):
     keep_logs(run, 0)
     assert attempt_folders(run.gmi(0).root) == [run.gmi(0).root / "attempt_0"]
     assert os.listdir(run.root / "gmi_0.bak") == ["result.json"]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "words"),
+    [
+        (("env=ant",), "env=ant algo=ppo"),
+        (("env=brax", "env.name=ant"), "env=brax env.name=ant algo=ppo"),
+        (("env=my tasks/cart.py:make", "algo=sac"), "env='my tasks/cart.py:make' algo=sac"),
+    ],
+)
+def test_a_job_that_was_stopped_says_how_to_continue_if_it_can(
+    tmp_path: Path, chosen: tuple[str, ...], words: str
+):
+    run = RunPaths(tmp_path)
+    config = build("train", TrainConfig, list(chosen))
+    # That training had not begun is said by the error already.
+    assert what_is_left(config, run) == "there is no checkpoint"
+    run.metrics.write_text('{"env_steps": 64}\n')
+    assert "run.stop_timeout_s is the time that GMIs get" in what_is_left(config, run)
+    save(run, 64)
+    command = f"continue: gmijax train {words} run.dir={tmp_path} run.resume=auto"
+    assert what_is_left(config, run) == command
 
 
 def test_films_of_others_are_not_ours(run: RunPaths):

@@ -28,7 +28,8 @@ from gmijax.supervise.backends import open_backend
 from gmijax.supervise.heartbeat import Heartbeat
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import WatchedGmi
-from gmijax.sweeps import children, jobs_per_gpu
+from gmijax.sweeps import children
+from gmijax.sweeps.curve_window import CurveWindow
 
 A_WHILE_S = 10_000.0
 LIMIT_S = 5.0
@@ -43,13 +44,13 @@ def stop(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stop]:
     real, stopped = time.monotonic, [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: real() + stopped[0])
     clock.running_s()
+    before = dict(vars(clock.running_s))
 
     def stop() -> None:
         stopped[0] += A_WHILE_S
 
     yield stop
-    clock.running_s._looked_s = real()
-    clock.running_s._left_out_s = 0.0
+    vars(clock.running_s).update(before)
 
 
 def after_looks(stop: Stop) -> Callable[[], bool | None]:
@@ -96,10 +97,16 @@ def test_a_wait_for_another_process_goes_on(stop: Stop) -> None:
     assert clock.wait_for(lambda _: bool(is_so()), LIMIT_S)
 
 
-def test_a_barrier_goes_on(stop: Stop, monkeypatch: pytest.MonkeyPatch) -> None:
+def barriers(limit_s: float) -> list[Barrier]:
+    """Of two ranks."""
     fd = create_exchange()
-    first, second = (Barrier(attach(fd, rank, 2, 10, 0), LIMIT_S, LIMIT_S) for rank in range(2))
+    made = [Barrier(attach(fd, rank, 2, 10, 0), limit_s, limit_s) for rank in range(2)]
     os.close(fd)
+    return made
+
+
+def test_a_barrier_goes_on(stop: Stop) -> None:
+    first, second = barriers(LIMIT_S)
     looks = 0
 
     def wait(_: float) -> bool:
@@ -111,9 +118,8 @@ def test_a_barrier_goes_on(stop: Stop, monkeypatch: pytest.MonkeyPatch) -> None:
 
     # Its device is at a step, the peer is silent.
     first.watch(SimpleNamespace(wait=wait))
-    looks = -1000
-    monkeypatch.setattr(first, "_timeout_s", 0.0)
-    monkeypatch.setattr(first, "_rendezvous_timeout_s", 0.0)
+    second.leave()
+    first, second = barriers(0.0)
     with pytest.raises(CollectiveTimeout):
         first.watch(SimpleNamespace(wait=lambda s: bool(time.sleep(s))))
     second.leave()
@@ -182,10 +188,10 @@ def test_no_time_limit_runs_while_another_process_compiles(tmp_path: Path) -> No
 def test_a_gmi_that_is_to_stop_is_not_late(tmp_path: Path, stop: Stop) -> None:
     supervisor, _ = supervised(tmp_path, "running")
     is_so = after_looks(stop)
+    ask = iter([supervisor.request_stop])
 
     def tick(_: Any) -> None:
-        if not supervisor._stop_requests:
-            supervisor.request_stop()
+        next(ask, lambda: None)()
         is_so()
 
     with pytest.raises(JobInterrupted, match="all processes have finished their work"):
@@ -228,20 +234,22 @@ def test_a_profile_is_not_late(stop: Stop) -> None:
     watch(())
 
 
-def test_jobs_of_a_sweep_are_not_late(stop: Stop, monkeypatch: pytest.MonkeyPatch) -> None:
-    window = jobs_per_gpu._CurveWindow([], LIMIT_S)
+def test_jobs_of_a_sweep_are_not_late(
+    stop: Stop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     job: Any = SimpleNamespace(progress=SimpleNamespace(env_steps=0, state="running"))
-    window._jobs = [job]
-    window._seen = [{0}]
+    window = CurveWindow([job], LIMIT_S)
     stop()
     assert not window.is_over()
-    child: Any = object.__new__(children.Child)
-    child._process = SimpleNamespace(poll=lambda: 0, pid=1)
-    child._ended_s, child._log, child._is_asked = None, Path("nowhere"), False
+    child = children.Child(children.Process("job", ("true",), tmp_path / "log"), {})
+    while child.look().exit_code is None:
+        time.sleep(0.01)
+    # Something that it has started is still there.
     monkeypatch.setattr(children, "members_of", lambda _: (1,))
-    assert child.look().exit_code is None
-    stop()
-    assert child.look().exit_code is None
+    for _ in range(2):
+        assert child.look().exit_code is None
+        stop()
+    child.close()
 
 
 def test_no_time_limit_is_by_another_clock() -> None:

@@ -328,8 +328,7 @@ def test_who_waited_in_vain_comes_before_who_lost_that_one() -> None:
 def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
     seen = {2: RemoteGmiStatus(None, 1, Heartbeat("running", 7, 99), None, 0)}
     answers: dict[str, Any] = {"start": 99, "poll": seen}
-    node = a_node()
-    node._ask = lambda method, *_: FakeAnswer(answers[method])
+    node = RemoteNode(lambda method, *_: FakeAnswer(answers[method]), 1, "10.0.0.2")
     gmi = node.start(2, GmiPaths(tmp_path))
     gmi.poll()  # Asks.
     assert gmi.poll() is None
@@ -347,8 +346,7 @@ def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
 
 def test_an_error_of_a_node_is_no_lost_node(tmp_path: Path) -> None:
     answers: dict[str, Any] = {"start": 99, "poll": ValueError("not a heartbeat")}
-    node = a_node()
-    node._ask = lambda method, *_: FakeAnswer(answers[method])
+    node = RemoteNode(lambda method, *_: FakeAnswer(answers[method]), 1, "10.0.0.2")
     gmi = node.start(2, GmiPaths(tmp_path))
     gmi.poll()  # Asks.
     with pytest.raises(ValueError, match="not a heartbeat"):
@@ -447,7 +445,9 @@ def test_nccl_of_a_node_takes_the_network_of_its_address_unless_the_user_says_an
 ) -> None:
     monkeypatch.setattr(nodes, "detect_machine", lambda: machine(0))
     monkeypatch.setattr(nodes, "listen", lambda _: socket.create_server(("127.0.0.1", 0)))
-    monkeypatch.setenv("NCCL_SOCKET_IFNAME", "")  # So that it is as before after the test.
+    # A node changes both; so that they are as before after the test.
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NCCL_SOCKET_IFNAME", "")
     monkeypatch.delenv("NCCL_SOCKET_IFNAME")
     here = {name: machine(0) for name in "ab"}
     plan = make_plan(PlanConfig(), ReduceConfig(), 16, machine(0), nodes=here)

@@ -20,7 +20,7 @@ from gmijax.collection.programs import (
     ActingPolicy,
     CollectedStep,
     RecordSpec,
-    _trained,
+    policy_of,
     random_policy,
     unroll,
 )
@@ -55,7 +55,7 @@ def unrolled() -> Unrolled:
     env = point_mass(episode_length=8)
     learner, size = make_learner(env.spec, algo), env.spec.obs_size
     state = jax.jit(lambda key: init_learner(learner, size, key))(jax.random.key(3))
-    choose = _trained(learner, deterministic=False)
+    choose = policy_of(learner, deterministic=False)
     policy = ActingPolicy(choose, (state.params, no_samples((size,))), "x")
     program = jax.jit(partial(unroll, env, policy, T, ALL))
     _, steps, counts = program(env.model, policy.weights, start(env))
@@ -111,7 +111,7 @@ def test_random_actions_fill_their_range_with_even_density():
 
 
 def test_a_deterministic_policy_acts_with_its_mean(unrolled: Unrolled):
-    choose = _trained(unrolled.learner, deterministic=True)
+    choose = policy_of(unrolled.learner, deterministic=True)
     obs, weights = jnp.ones((N, 2)), unrolled.policy.weights
     first, density = choose(weights, obs, env_keys(jax.random.key(1), 0, N))
     second, _ = choose(weights, obs, env_keys(jax.random.key(2), 0, N))

@@ -84,7 +84,6 @@ def test_who_waits_is_told_and_finds_what_was_compiled(
         compile_entry(tmp_path)
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    monkeypatch.setattr(compile_lock, "_POLL_S", 0.0)
     monkeypatch.setattr(compile_lock, "ON_WAIT", [lambda: nullcontext(calls.append("waits"))])
     assert compile_alone(tmp_path, "jit_f", "k", lambda: "loaded") == "loaded"
     assert calls == ["asks", "waits", "asks", "asks", "unlocks"]

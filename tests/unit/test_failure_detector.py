@@ -55,7 +55,7 @@ def test_who_waits_too_is_not_named(blocks: list[SharedBlock]) -> None:
 def test_a_call_that_only_this_rank_does_not_finish_times_out(blocks: list[SharedBlock]) -> None:
     first, *others = barriers_of(blocks, 0.3, 3.0, 3.0)
     for other in others:
-        other._arrive()
+        other.arrive()
     with pytest.raises(CollectiveTimeout, match=r"for GMIs \[1, 2\]"):
         first.watch(NEVER)
 
@@ -153,7 +153,7 @@ def test_the_watch_of_a_step_looks_at_those_who_have_arrived_after_it(
         first.wait()
         for other in meeting:
             other.result()
-    others[0]._arrive()
+    others[0].arrive()
     end(blocks, 1)
     with pytest.raises(PeerLost, match="GMI 1 is gone"):
         first.watch(NEVER)

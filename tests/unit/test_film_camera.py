@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import mujoco
 import numpy as np
 import pytest
 
 from gmijax.sim.camera import choose_camera, free_robot
 from gmijax.sim.registry import TASKS, make_env
-from gmijax.sim.stage import Stage, put
+from gmijax.sim.stage import put, show_command
 
 FREE = '<body name="{0}"><freejoint/><geom size=".3"/>{1}</body>'
 LEG = '<body name="leg"><joint name="hip"/><geom size=".1" pos="1 0 0"/>{0}</body>'
@@ -114,21 +111,18 @@ def test_our_own_tasks_have_a_camera_for_it(task: str):
 
 def test_arrows_show_what_a_robot_is_commanded():
     model = _model(ROBOT, HIP)
-    stage: Any = Stage.__new__(Stage)  # It has no OpenGL, which arrows do not need.
-    scene = mujoco.MjvScene(model, 8)
-    stage._mujoco, stage._model, stage._data = mujoco, model, mujoco.MjData(model)
-    stage._renderer = SimpleNamespace(scene=scene)
+    scene, data = mujoco.MjvScene(model, 8), mujoco.MjData(model)
     quarter = np.sqrt(0.5)
     turned = [0.0, 0.0, 1.0, quarter, 0.0, 0.0, quarter, *np.zeros(model.nq - 7)]
-    command = put(stage._data, np.array([*turned, 1.0, 0.0, 0.4]))
+    command = put(data, np.array([*turned, 1.0, 0.0, 0.4]))
     assert command.tolist() == [1.0, 0.0, 0.4]
-    mujoco.mj_forward(model, stage._data)
-    stage._show_command(free_robot(model), command)
+    mujoco.mj_forward(model, data)
+    show_command(scene, model, data, free_robot(model), command)
     way, turn = scene.geoms[0], scene.geoms[1]
     assert scene.ngeom == 2
     np.testing.assert_allclose(way.mat[:, 2], [0.0, 1.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(turn.mat[:, 2], [0.0, 0.0, 1.0], atol=1e-6)
     assert way.size[2] / turn.size[2] == pytest.approx(1.0 / 0.4)
-    assert turn.pos[2] > stage._data.geom_xpos[:, 2].max()
-    stage._show_command(free_robot(model), np.zeros(3))
+    assert turn.pos[2] > data.geom_xpos[:, 2].max()
+    show_command(scene, model, data, free_robot(model), np.zeros(3))
     assert scene.ngeom == 2

@@ -33,11 +33,16 @@ def on_all(pool: ThreadPoolExecutor, call: Callable[[int], T]) -> list[T]:
     return [one.result() for one in [pool.submit(call, rank) for rank in range(RANKS)]]
 
 
-def groups(build: Any = None, timeout_s: float = 20.0) -> list[GroupReducer]:
+def messengers(timeout_s: float = 20.0) -> list[Messenger]:
+    """Of all ranks."""
+    return [Messenger(block, timeout_s) for block in pipe_blocks(RANKS)]
+
+
+def groups(build: Any = None, between: list[Messenger] | None = None) -> list[GroupReducer]:
     """Of all ranks; `build(rank, num_floats)` makes the reducers for large means."""
     return [
-        GroupReducer(Messenger(block, timeout_s), lambda size, rank=block.rank: build(rank, size))
-        for block in pipe_blocks(RANKS)
+        GroupReducer(one, lambda size, rank=rank: build(rank, size))
+        for rank, one in enumerate(between or messengers())
     ]
 
 
@@ -74,7 +79,8 @@ def test_ranks_that_ask_for_different_things_are_told_both(
 ) -> None:
     """By messages and by a reducer, whoever comes first."""
     exchanges = host_ranks(*[LARGE] * RANKS, timeout_s=1.0)
-    members = groups(lambda rank, _: exchanges[rank], timeout_s=10.0)
+    between = messengers(timeout_s=10.0)
+    members = groups(lambda rank, _: exchanges[rank], between)
     operations = ("mean", "sum", "mean")
 
     def reduce(rank: int) -> str:
@@ -83,7 +89,7 @@ def test_ranks_that_ask_for_different_things_are_told_both(
         return str(caught.value)
 
     early = pool.submit(reduce, first)
-    while first == 1 and not members[0]._messenger.has_message(1, tag=1):
+    while first == 1 and not between[0].has_message(1, tag=1):
         pass
     while first == 0 and not exchanges[0].barrier.step:
         pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -101,10 +102,18 @@ def posts(
     count: int, part_bytes: int = 1 << 20, timeout_s: float = 5.0, memory: Any = FakeDeviceMemory
 ) -> list[Messenger]:
     """Messengers of `count` ranks that share memory of a device, in this process."""
+    return patient([timeout_s] * count, part_bytes, memory)
+
+
+def patient(
+    timeouts_s: Sequence[float], part_bytes: int = 1 << 20, memory: Any = FakeDeviceMemory
+) -> list[Messenger]:
+    """The same with a time limit for each rank."""
+    count = len(timeouts_s)
     others = [[peer for peer in range(count) if peer != rank] for rank in range(count)]
     return [
         Messenger(block, timeout_s, DeviceBuffers(peers, memory, part_bytes))
-        for block, peers in zip(pipe_blocks(count), others, strict=True)
+        for block, timeout_s, peers in zip(pipe_blocks(count), timeouts_s, others, strict=True)
     ]
 
 
@@ -155,8 +164,7 @@ def test_what_was_not_sent_for_want_of_room_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("gmijax.channels.mailboxes.MAX_WAITING_BYTES", 1)
-    first, second = posts(2, timeout_s=0.1)
-    second._timeout_s = 30.0
+    first, second = patient([0.1, 30.0])
     first.send(np.ones(10**6), 1)
     with pytest.raises(CollectiveTimeout, match=r"in send, step 2, for GMIs \[1\]"):
         first.send(jnp.arange(5000.0), 1)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from gmijax.channels import pipe
 from gmijax.channels.pipe import PipeReader, PipeWriter
 from gmijax.channels.pipe_block import (
     END,
@@ -23,7 +25,7 @@ from gmijax.channels.pipe_block import (
     create_pipes,
 )
 from gmijax.channels.pipe_format import message_bytes
-from gmijax.collectives.shared_memory import process_of, take_line
+from gmijax.collectives.shared_memory import Fence, process_of, take_line
 from gmijax.errors import CollectiveError, CollectiveTimeout, PipeClosed
 
 CAPACITY = 8192
@@ -162,14 +164,24 @@ def test_a_rank_that_is_taken_and_other_memory_are_refused(ends: Ends) -> None:
 def test_nothing_is_told_before_the_fence(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
     """That there is one: what it does cannot be seen on x86, which keeps the order anyway."""
     seen: list[int] = []
-    writer, reader = ends.writer, ends.reader
-    monkeypatch.setattr(writer, "_fence", lambda: seen.append(reader.outstanding_bytes))
+
+    class Seen(Fence):
+        look: Callable[[], int] | None = None
+
+        def __call__(self) -> None:
+            if self.look is not None:
+                seen.append(self.look())
+
+    at_writer, at_reader = fences = Seen(), Seen()
+    monkeypatch.setattr(pipe, "Fence", partial(next, iter(fences)))
+    writer, reader = PipeWriter(ends.blocks[0], 1), PipeReader(ends.blocks[1], 0)
+    at_writer.look = lambda: reader.outstanding_bytes
     writer.put([raw(3)], timeout_s=0.0)
     assert seen == [0, 0]  # One before memory is used again, one before it is handed over.
     in_use = reader.outstanding_bytes
     assert in_use > 0
     reader.get(timeout_s=0.0)
-    monkeypatch.setattr(reader, "_fence", lambda: seen.append(writer.outstanding_bytes))
+    at_reader.look = lambda: writer.outstanding_bytes
     reader.release()
     assert seen == [0, 0, in_use]
     assert writer.released_messages == 1

@@ -166,7 +166,9 @@ def test_a_robot_that_repeats_actions_has_no_walking_test(
     said = "env.action_repeat=2; the walking test takes 1 only"
     with pytest.raises(ConfigError, match=f"^walking_envs=8: {said}$"):
         playing.play(config_of(f"run.dir={run.root}", "walking_envs=8"))
-    assert playing._walking(config_of(f"run.dir={run.root}"), None) == f"no walking test: {said}"
+    assert (
+        playing.walking_lines(config_of(f"run.dir={run.root}"), None) == f"no walking test: {said}"
+    )
     with pytest.raises(ConfigError, match=r"^env.action_repeat=2: the walking test takes 1 only$"):
         walking_env(env, ROBOTS["go1"], "jax", 4)
 
@@ -185,8 +187,8 @@ def test_a_robot_without_randomisation_cannot_be_played_with_one(
 def test_without_a_walking_test_it_is_said_why(monkeypatch: pytest.MonkeyPatch):
     env = EnvConfig(suite="playground", name="go1", episode_length=None)
     monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
-    assert "walking_envs=8" in playing._walking(config_of(), None)
-    assert "walking_envs=0" in playing._walking(config_of("walking_envs=0"), None)
+    assert "walking_envs=8" in playing.walking_lines(config_of(), None)
+    assert "walking_envs=0" in playing.walking_lines(config_of("walking_envs=0"), None)
 
 
 def test_playing_leaves_a_gpu_to_the_job_that_trains_on_it(run: RunPaths):

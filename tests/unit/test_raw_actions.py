@@ -16,7 +16,7 @@ from gmijax.a3c.a3c import gradients
 from gmijax.a3c.rollout import collect
 from gmijax.a3c.targets import Unrolls, batch_targets
 from gmijax.cli.compose import compose
-from gmijax.collection.programs import _trained
+from gmijax.collection.programs import policy_of
 from gmijax.learning.learner import Learner, TrainState, acting_weights, init_learner, make_learner
 from gmijax.learning.normalize import normalize
 from gmijax.learning.unroll import act
@@ -101,7 +101,7 @@ def test_a_data_set_has_actions_and_their_densities(start) -> None:
     learner, state, envs = start
     weights = acting_weights(learner, state)
     keys = env_keys(jax.random.key(2), 0, N)
-    choose = _trained(learner, deterministic=False)
+    choose = policy_of(learner, deterministic=False)
     action, density = choose(tuple(weights[:2]), envs.env.obs, keys)
     assert float(jnp.max(jnp.abs(action))) <= 1.0
     # By the change of variables, where a float32 still tells the action from its limit.

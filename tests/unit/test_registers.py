@@ -7,11 +7,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from gmijax.channels.registers import create_registers, open_registers
+from gmijax.channels import registers
+from gmijax.channels.registers import Register, create_registers, open_registers
 from gmijax.collectives.shared_memory import Fence
 
 
@@ -38,13 +40,30 @@ def test_a_reader_gets_the_newest_value_once(fd) -> None:
 class Interrupted(Fence):
     """A fence of a reader or a writer at which something else happens first, each time."""
 
-    def __init__(self, *events: Callable[[], object]) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._events = list(events)
+        self.events: list[Callable[[], object]] = []
 
     def __call__(self) -> None:
-        if self._events:
-            self._events.pop(0)()
+        if self.events:
+            self.events.pop(0)()
+
+
+class Pair(NamedTuple):
+    """A writer and a reader of one register, each with its fence."""
+
+    writer: Register
+    reader: Register
+    at_writer: Interrupted
+    at_reader: Interrupted
+
+
+@pytest.fixture
+def pair(fd, monkeypatch: pytest.MonkeyPatch) -> Pair:
+    at_writer, at_reader = fences = Interrupted(), Interrupted()
+    monkeypatch.setattr(registers, "Fence", partial(next, iter(fences)))
+    [writer], [reader] = (open_registers(fd, [16]) for _ in fences)
+    return Pair(writer, reader, at_writer, at_reader)
 
 
 def nothing() -> None:
@@ -59,8 +78,8 @@ def die() -> None:
     raise Killed
 
 
-def test_a_value_that_is_torn_is_not_given_out(fd) -> None:
-    writer, reader = open_registers(fd, [16])[0], open_registers(fd, [16])[0]
+def test_a_value_that_is_torn_is_not_given_out(pair: Pair) -> None:
+    writer, reader = pair.writer, pair.reader
     publish = [partial(writer.publish, np.full(4, k, np.int32), tag=k) for k in range(4)]
     for once in publish[:2]:
         once()
@@ -68,25 +87,25 @@ def test_a_value_that_is_torn_is_not_given_out(fd) -> None:
     def die_in_the_fourth() -> None:
         """After the third and half of the fourth, which goes where the second one is."""
         publish[2]()
-        writer._fence = Interrupted(nothing, die)
+        pair.at_writer.events = [nothing, die]
         with pytest.raises(Killed):
             publish[3]()
 
-    reader._fence = Interrupted(nothing, die_in_the_fourth)
+    pair.at_reader.events = [nothing, die_in_the_fourth]
     snapshot = reader.read()
     assert snapshot is not None
     assert (snapshot.count, snapshot.tag, snapshot.values.view(np.int32)[0]) == (3, 2, 2)
 
 
-def test_a_reader_gives_up_on_a_writer_that_is_always_faster(fd) -> None:
-    writer, reader = open_registers(fd, [16])[0], open_registers(fd, [16])[0]
+def test_a_reader_gives_up_on_a_writer_that_is_always_faster(pair: Pair) -> None:
+    writer, reader = pair.writer, pair.reader
     writer.publish(np.zeros(4, np.int32))
 
     def publish_twice() -> None:
         for _ in range(2):
             writer.publish(np.zeros(4, np.int32))
 
-    reader._fence = Interrupted(*[nothing, publish_twice] * 3)
+    pair.at_reader.events = [nothing, publish_twice] * 3
     assert reader.read() is None
     snapshot = reader.read()
     assert snapshot is not None

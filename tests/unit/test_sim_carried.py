@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from compiled_tasks import on_device
 
 from gmijax.errors import ConfigError
 from gmijax.sim import episode
@@ -68,7 +69,7 @@ def test_what_is_carried_moves_an_environment_as_mujoco_in_c(impl: str):
     hand = data.mocap_pos.copy()
     qpos, qvel = (jnp.tile(jnp.asarray(x, jnp.float32), (2, 1)) for x in (data.qpos, data.qvel))
     first = {name: jnp.asarray(value) for name, value in driven(0, hand).items()}
-    state = jax.vmap(lambda q, v: sim.start(q, v, **first))(qpos, qvel)
+    state = on_device(jax.vmap(lambda q, v: sim.start(q, v, **first))(qpos, qvel))
     assert state.act is not None
     assert state.act.shape == (2, 3)
     step = jax.jit(jax.vmap(sim.step, in_axes=(None, 0, 0)))
@@ -82,13 +83,13 @@ def test_what_is_carried_moves_an_environment_as_mujoco_in_c(impl: str):
             clock_s = data.time
             mujoco.mj_step(mj_model, data)
         set_now = {
-            name: jnp.tile(jnp.asarray(value, getattr(state, name).dtype), (2, *[1] * value.ndim))
+            name: np.tile(value, (2, *[1] * value.ndim)).astype(getattr(state, name).dtype)
             for name, value in now.items()
         }
         state, sensed = step(
             sim.model,
-            state._replace(**set_now),
-            jnp.tile(jnp.asarray(ctrl, jnp.float32), (2, 1)),
+            state._replace(**on_device(set_now)),
+            np.tile(ctrl.astype(np.float32), (2, 1)),
         )
         np.testing.assert_allclose(state.act[1], data.act, atol=1e-5)
         np.testing.assert_allclose(state.time[1], data.time, rtol=1e-5)

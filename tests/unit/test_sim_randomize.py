@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from compiled_tasks import on_device
 
 from gmijax.cli.compose import compose
 from gmijax.config import EnvConfig
@@ -191,10 +192,10 @@ def test_every_environment_moves_as_mujoco_in_c_says(impl: str):
         pytest.importorskip("warp")
     many = randomized(sledge(impl), ALL_LEAVES, seed=1, first_env=0, num_envs=NUM_ENVS)
     batched = wrappers.vectorise(many)
-    state = batched.reset(many.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
+    state = on_device(batched.reset(many.model, env_keys(jax.random.key(0), 0, NUM_ENVS)))
     step = jax.jit(batched.step)
     for _ in range(STEPS):
-        state = step(many.model, state, jnp.tile(jnp.array(STARTS["ctrl"]), (NUM_ENVS, 1)))
+        state = step(many.model, state, np.tile(np.float32(STARTS["ctrl"]), (NUM_ENVS, 1)))
     leaves = drawn(sledge(), seed=1)
     effects = dict.fromkeys(RANDOMIZED_LEAVES, 0.0)
     for index in range(NUM_ENVS):

@@ -25,7 +25,7 @@ from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.held import OpenFolder
 from gmijax.supervise.run_gmis import StopSignals
-from gmijax.sweeps import jobs_per_gpu, kind, scheduler
+from gmijax.sweeps import kind, nodes, profile_jobs, scheduler
 from gmijax.sweeps.children import ChildStatus
 from gmijax.sweeps.host import ChildStart, LocalHost, Order
 from gmijax.sweeps.jobs import Job, jobs_of
@@ -236,13 +236,13 @@ def test_a_profile_of_a_job_with_two_gpus_has_both(
         def is_over(self) -> bool:
             return True
 
-    monkeypatch.setattr(jobs_per_gpu, "_CurveWindow", Window)
+    monkeypatch.setattr(profile_jobs, "CurveWindow", Window)
     monkeypatch.setattr(FakeHost, "open", lambda *_: None)
     host = FakeHost("a")
     host.machine = machine(2, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
-    bench = jobs_per_gpu._Bench(host, tmp_path, StopSignals())
+    bench = profile_jobs.Bench(host, tmp_path, StopSignals())
     for settings in (SweepConfig(), SweepConfig(gpus=(1, 0))):
-        found = jobs_per_gpu._profile(settings, jobs(1, "plan.gpus=2")[0], 1, bench)
+        found = profile_jobs.profile_jobs(settings, jobs(1, "plan.gpus=2")[0], 1, bench)
         assert isinstance(found, Measured)
     assert host.started == [0, 0]
 
@@ -355,14 +355,15 @@ def test_of_jobs_of_one_program_all_fail_that_may_not_run_again(tmp_path: Path) 
     ]
 
 
-def test_what_a_node_refuses_is_raised_here_and_does_not_lose_it() -> None:
-    here = SweepNode.__new__(SweepNode)
-    here._host = FakeHost("b")
-
+def test_what_a_node_refuses_is_raised_here_and_does_not_lose_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def refuse(*_: Any) -> None:
         raise BackendUnavailable("no daemon")
 
-    here._host.open = refuse  # type: ignore[method-assign]
+    monkeypatch.setattr(FakeHost, "open", refuse)
+    monkeypatch.setattr(nodes, "LocalHost", lambda _: FakeHost("b"))
+    here = SweepNode({}, "nowhere", None, "10.0.0.2")
 
     class Answer:
         def __init__(self, value: Any) -> None:

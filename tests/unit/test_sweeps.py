@@ -23,13 +23,15 @@ from gmijax.runs.folder import read_json, write_json
 from gmijax.runs.held import OpenFolder, is_locked, locked
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.run_gmis import StopSignals
-from gmijax.sweeps import jobs_per_gpu
+from gmijax.sweeps import curve_window, jobs_per_gpu
+from gmijax.sweeps.curve_window import CurveWindow
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import Job, jobs_of, placed, require_placeable, state_of
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.objective import why_not_comparable, with_objective
 from gmijax.sweeps.packs import most_together, require_packable
 from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.profile_jobs import profiled_job
 from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import JobsReport, spread, tables
 from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
@@ -528,7 +530,7 @@ def test_jobs_at_a_time_by_profiling(
         rate = rates[len(done) - 1]
         return NotRunnable("no memory") if rate is None else Measured(rate / count, 100.0, 0.1)
 
-    monkeypatch.setattr(jobs_per_gpu, "_profile", profile)
+    monkeypatch.setattr(jobs_per_gpu, "profile_jobs", profile)
     jobs = jobs_of([compose(f"seed={seed}") for seed in range(num_jobs)])
     hosts = [LocalHost(machine(1, mps_control=Path("/usr/bin/nvidia-cuda-mps-control")))]
     for _ in range(2):  # The second time by the store.
@@ -555,9 +557,17 @@ def test_jobs_at_a_time_by_profiling(
     ],
 )
 def test_no_more_at_a_time_than_let_all_jobs_run(
-    settings: dict[str, Any], override: str, expected: int, monkeypatch: pytest.MonkeyPatch
+    settings: dict[str, Any],
+    override: str,
+    expected: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(jobs_per_gpu, "_best", lambda *_: 32)
+    def profile(*_: Any) -> Measured:
+        return Measured(100.0, 100.0, 0.1)  # Each as fast as alone, however many there are.
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(jobs_per_gpu, "profile_jobs", profile)
     jobs = jobs_of([compose(f"seed={seed}", override) for seed in range(3)])
     hosts, quiet = [LocalHost(machine(2))], open_console(show=False)
     found = with_jobs_per_gpu(SweepConfig(**settings), jobs, hosts, quiet, StopSignals())
@@ -566,7 +576,7 @@ def test_no_more_at_a_time_than_let_all_jobs_run(
 
 def test_a_profile_of_a_job_is_not_sent_anywhere() -> None:
     [job] = jobs_of([compose("wandb.mode=online", "eval.every=100")])
-    profiled = jobs_per_gpu._copy(job, 1, 10**12).config
+    profiled = profiled_job(job, 1, 10**12).config
     assert (profiled.wandb.mode, profiled.eval.every) == ("off", None)
 
 
@@ -583,9 +593,9 @@ def test_without_a_gpu_a_job_has_two_cores() -> None:
 
 def test_a_profile_counts_while_all_jobs_train(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 0.0
-    monkeypatch.setattr(jobs_per_gpu, "running_s", lambda: now_s)
+    monkeypatch.setattr(curve_window, "running_s", lambda: now_s)
     jobs = jobs_of([compose(f"seed={seed}") for seed in range(2)])
-    window = jobs_per_gpu._CurveWindow(jobs, 60.0)
+    window = CurveWindow(jobs, 60.0)
     while not window.is_over():
         now_s += 0.5
         jobs[0].progress.env_steps += 50
@@ -594,7 +604,7 @@ def test_a_profile_counts_while_all_jobs_train(monkeypatch: pytest.MonkeyPatch) 
     assert window.steps_per_s == pytest.approx(200.0)
     assert window.iteration_s == pytest.approx(0.5)
     assert 14.0 < now_s < 18.0
-    late = jobs_per_gpu._CurveWindow(jobs, 5.0)
+    late = CurveWindow(jobs, 5.0)
     now_s += 6.0
     assert late.is_over()
     assert late.steps_per_s is None

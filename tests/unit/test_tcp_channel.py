@@ -30,10 +30,10 @@ def address() -> Iterator[str]:
         yield reserved
 
 
-def ends(address: str) -> tuple[RemoteReader, RemoteWriter]:
+def ends(address: str, **options: float) -> tuple[RemoteReader, RemoteWriter]:
     return (
         RemoteReader(address, 1, 0, CAPACITY, SECRET),
-        RemoteWriter(address, 0, 1, CAPACITY, SECRET),
+        RemoteWriter(address, 0, 1, CAPACITY, SECRET, **options),
     )
 
 
@@ -92,21 +92,22 @@ def message(*parts: bytes) -> bytes:
 
 
 def data(sequence: int) -> bytes:
-    return message(tcp_channel._HEADER.pack(tcp_channel.DATA, sequence), bytes([66]))
+    return message(tcp_channel.HEADER.pack(tcp_channel.DATA, sequence), bytes([66]))
 
 
 def test_nobody_listens_once_the_agent_is_there_and_its_death_is_seen_at_once(
     address: str,
 ) -> None:
-    reader, writer = ends(address)
-    send(writer, 1)
-    assert receive(reader, 1) == [1]
-    for _ in range(100):
-        with pytest.raises(ConnectionRefusedError):
-            socket.create_connection(at(address), 5.0)
-    send(writer, 2)
-    assert receive(reader, 1) == [2]
-    writer._connection.close()  # As if it were killed: no goodbye.
+    reader = RemoteReader(address, 1, 0, CAPACITY, SECRET)
+    with agent(address) as connection:
+        connection.sendall(data(0))
+        assert receive(reader, 1) == [66]
+        for _ in range(100):
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection(at(address), 5.0)
+        connection.sendall(data(1))
+        assert receive(reader, 1) == [66]
+    # It is gone without a goodbye, as if it were killed.
     assert isinstance(why_lost(reader, 2.0), PeerLost)
     reader.close()
 
@@ -123,8 +124,8 @@ def test_strangers_before_the_agent_keep_it_out_and_deliver_nothing(
         for _ in range(50 if kind == "silent" else 0):
             held.enter_context(socket.create_connection(at(address), 5.0))
         if kind == "other job":
-            other = RemoteWriter(address, 0, 1, CAPACITY, os.urandom(32))
-            held.callback(other._connection.close)
+            other = RemoteWriter(address, 0, 1, CAPACITY, os.urandom(32), farewell_s=0.0)
+            held.callback(other.close)
             send(other, 66)
         assert why_lost(reader, SILENT_S) is None
         writer = RemoteWriter(address, 0, 1, CAPACITY, SECRET)
@@ -225,11 +226,8 @@ def test_an_agent_that_closes_before_its_trainer_listens_loses_nothing(
     reader.close()
 
 
-def test_an_agent_does_not_wait_for_a_trainer_that_has_left(
-    address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gmijax.channels.tcp_channel._FAREWELL_S", 60.0)
-    reader, writer = ends(address)
+def test_an_agent_does_not_wait_for_a_trainer_that_has_left(address: str) -> None:
+    reader, writer = ends(address, farewell_s=60.0)
     send(writer, 1)
     assert receive(reader, 1) == [1]
     send(writer, 2)
@@ -239,14 +237,13 @@ def test_an_agent_does_not_wait_for_a_trainer_that_has_left(
     assert time.monotonic() - started_s < 30.0  # Less than for one that is there.
 
 
-def test_an_agent_does_not_wait_for_ever_for_a_trainer_that_never_comes(
-    address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gmijax.channels.tcp_channel._FAREWELL_S", 0.1)
-    writer = RemoteWriter(address, 0, 1, CAPACITY, SECRET)
+def test_an_agent_does_not_wait_for_ever_for_a_trainer_that_never_comes(address: str) -> None:
+    writer = RemoteWriter(address, 0, 1, CAPACITY, SECRET, farewell_s=0.1)
     send(writer, 1)
-    writer.close()
-    assert writer._connection.is_closed
+    closing = threading.Thread(target=writer.close)
+    closing.start()
+    closing.join(60.0)
+    assert not closing.is_alive()
 
 
 def test_an_address_that_cannot_be_is_named() -> None:
@@ -255,27 +252,25 @@ def test_an_address_that_cannot_be_is_named() -> None:
 
 
 def test_what_is_no_message_of_a_channel_is_an_error(address: str) -> None:
-    reader, writer = ends(address)
-    for junk in ([], [b""], [b"junk"], [b"x" * tcp_channel._HEADER.size]):
-        writer._connection.send(junk)
-        with pytest.raises(CollectiveError, match="GMI 1: no message of a channel from GMI 0"):
-            receive(reader, 1)
-    send(writer, 7)
-    assert receive(reader, 1) == [7]
-    writer.close()
+    reader = RemoteReader(address, 1, 0, CAPACITY, SECRET)
+    with agent(address) as connection:
+        for junk in ([], [b""], [b"junk"], [b"x" * tcp_channel.HEADER.size]):
+            connection.sendall(message(*junk))
+            with pytest.raises(CollectiveError, match="GMI 1: no message of a channel from GMI 0"):
+                receive(reader, 1)
+        connection.sendall(data(0))
+        assert receive(reader, 1) == [66]
     reader.close()
 
 
 def test_a_message_is_missed_when_it_is_lost(address: str) -> None:
-    reader, writer = ends(address)
-    send(writer, 1)
-    assert receive(reader, 1) == [1]
-    writer._sequence += 1
-    send(writer, 3)
-    with pytest.raises(CollectiveError, match="message 1 from GMI 0 is lost, here is message 2"):
-        receive(reader, 1)
-    for end in (writer, reader):
-        end._connection.close()
+    reader = RemoteReader(address, 1, 0, CAPACITY, SECRET)
+    with agent(address) as connection:
+        connection.sendall(data(0) + data(2))
+        assert receive(reader, 1) == [66]
+        with pytest.raises(CollectiveError, match="message 1 from GMI 0 is lost, here is message"):
+            receive(reader, 1)
+    reader.close()
 
 
 def test_a_secret_that_can_be_guessed_is_refused(address: str) -> None:

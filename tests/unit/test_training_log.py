@@ -97,10 +97,9 @@ def test_reports_come_in_order_from_a_thread_of_their_own_and_errors_with_the_ne
     assert written == [1, 2, 3]
 
 
-def test_a_report_that_cannot_come_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gmijax.learning.report_thread._LAST_LINE_S", 60.0)
+def test_a_report_that_cannot_come_is_not_waited_for() -> None:
     is_there = threading.Event()
-    thread = ReportThread(lambda: is_there.wait(90))
+    thread = ReportThread(lambda: is_there.wait(90), last_line_s=60.0)
     thread.report()
     thread.give_up()
     started = time.monotonic()

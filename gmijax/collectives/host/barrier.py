@@ -64,7 +64,7 @@ class Barrier:
         self._operation = ""
         self._is_open = False
         self._fence = Fence()
-        self._arrive()
+        self.arrive()
 
     def restart(self) -> None:
         """Says that the calls so far belong to the start: the next one is the first."""
@@ -106,7 +106,7 @@ class Barrier:
           PeerLost: the process of a rank that has not arrived is gone, or another node.
           CollectiveTimeout: ranks did not arrive in time.
         """
-        self._arrive()
+        self.arrive()
         self._wait(while_unresponsive=while_unresponsive, looks_at_nodes=looks_at_nodes)
 
     def watch(self, done: threading.Event) -> None:
@@ -183,7 +183,8 @@ class Barrier:
         if unresponsive := detector.unresponsive(self._peers):
             detector.give_up(unresponsive)
 
-    def _arrive(self) -> None:
+    def arrive(self) -> None:
+        """Arrives, and waits for nobody."""
         self._fence()
         self._sequence[self._block.rank] += 1
 
