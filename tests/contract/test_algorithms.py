@@ -94,6 +94,9 @@ def test_every_algorithm_has_a_row() -> None:
 def test_iterations_change_weights_and_keep_shapes(case: Case) -> None:
     program = SingleRankCommunicator().program(partial(case.algorithm.iterate, ENV, case.learner))
     state, envs = case.first(0), case.memory()
+    # Restored from a checkpoint they have no weak types: that would be another program.
+    leaves = jax.tree.leaves((state, envs))
+    assert not any(getattr(leaf, "weak_type", False) for leaf in leaves)  # Keys have no such type.
     first = jax.tree.map(jnp.copy, state)
     program.trace(ENV.model, state, envs)
     program.compile()
