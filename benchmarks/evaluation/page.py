@@ -49,7 +49,6 @@ def front() -> list[str]:
     return filled(
         "front",
         ant=_of(seconds_to_mark("ant"), ".1f"),
-        humanoid=_of(seconds_to_mark("humanoid"), ".1f"),
         eight=_of(first_gains("steady_steps_per_s").get(EIGHT), ".2f"),
         mjlab=eight_packed(MJLAB),
         cleanrl=eight_packed(CLEANRL),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -47,6 +48,12 @@ def test_every_table_stands_in_one_page_of_the_evaluation():
 def test_the_front_page_has_its_own_figures():
     text = (check.ROOT / "README.md").read_text()
     assert {match[2] for match in check.TABLE.finditer(text)} == {"front", "advice"}
+
+
+def test_a_figure_of_the_front_page_is_of_three_runs_at_least():
+    repeats = [int(n) for line in TABLES["front"]() for n in re.findall(r"(\d+) runs? \|", line)]
+    assert len(repeats) >= 5
+    assert min(repeats) >= 3
 
 
 def test_a_wrong_digit_is_found(tmp_path: Path):
