@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ray_cluster import RAY, Cluster, events, two_nodes
+from ray_cluster import RAY, Cluster, two_nodes
 from training_jobs import (
     FOREVER,
     STEPS,
     TINY,
+    events,
     gmi_pid,
     iteration_of,
     kill,
