@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from supervision import save
@@ -31,7 +32,8 @@ def test_it_waits_for_the_first_checkpoint_of_a_training(
             save(run, 100)
 
     monkeypatch.setattr(viewing, "missing", tuple)
-    monkeypatch.setattr(viewing.time, "sleep", sleep)
+    # In place of the module: its function is that of all threads, also of what other tests left.
+    monkeypatch.setattr(viewing, "time", SimpleNamespace(sleep=sleep))
     with locked(run.lock, "x"):
         config, env, changed = viewing.opened_once_saved(
             build("view", ViewConfig, ()), open_console(show=True)
