@@ -90,3 +90,22 @@ def part_of(machine: Machine, gpu: int, count: int) -> Part:
         ("taskset", "--cpu-list", ",".join(map(str, cores))),
         {"CUDA_VISIBLE_DEVICES": device, "CUDA_DEVICE_ORDER": "PCI_BUS_ID"},
     )
+
+
+def on_parts(
+    machine: Machine, count: int, turns: Sequence[Turn], run: Callable[[Turn, Part], Made]
+) -> list[Made]:
+    """Runs all of `turns`, each on a part of the machine if at least two GPUs are used.
+
+    Args:
+      machine: where they run.
+      count: GPUs to use, if there are as many.
+      turns: what is run.
+      run: runs one on a part; on all of the machine where that is not divided.
+    """
+    used = min(count, len(machine.gpus))
+
+    def alone(turn: Turn, gpus: tuple[int, ...]) -> Made:
+        return run(turn, part_of(machine, gpus[0], used) if gpus else Part())
+
+    return on_free_gpus(used if used > 1 else None, turns, lambda _: 1, alone)

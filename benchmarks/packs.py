@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.free_gpus import Part, on_free_gpus, part_of
+from benchmarks.free_gpus import Part, on_parts
 from benchmarks.records import results_file
 from benchmarks.runner import deadline, exit_code, in_turn, options, run_command
 from benchmarks.steady import rate_of_jobs
@@ -52,13 +52,12 @@ class Benchmark:
 
     def run(self, ways: Sequence[Way]) -> bool:
         """Whether there was time for all."""
-        count, repeats = min(self._given.gpus, len(self._machine.gpus)), range(self._given.repeats)
+        given = self._given
 
-        def repeat(number: int, gpus: Sequence[int]) -> bool:
-            part = part_of(self._machine, gpus[0], count) if gpus else Part()
+        def repeat(number: int, part: Part) -> bool:
             return self._repeat(number, ways, part)
 
-        return all(on_free_gpus(count if count > 1 else None, repeats, lambda _: 1, repeat))
+        return all(on_parts(self._machine, given.gpus, range(given.repeats), repeat))
 
     def _repeat(self, number: int, ways: Sequence[Way], part: Part) -> bool:
         num_rows = 0

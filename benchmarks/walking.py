@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import Any
 
 import gmijax
-from benchmarks.free_gpus import Part, on_free_gpus, part_of
+from benchmarks.free_gpus import Part, on_parts
 from benchmarks.peers.side import variables_of_brax
 from benchmarks.records import results_file
 from benchmarks.runner import deadline, exit_code, in_turn, options, run_command
@@ -77,18 +77,15 @@ class Benchmark:
     def run(self) -> None:
         """Trains with all seeds, tests, and writes both down."""
         trainers = [OURS] if self._given.script is None else [OURS, SCRIPT]
-        count = min(self._given.gpus, len(self._machine.gpus), self._given.seeds)
+        count = max(1, min(self._given.gpus, len(self._machine.gpus), self._given.seeds))
         if not self._given.cold:
             for trainer in trainers:
                 self._train(trainer, "compile", Part(), is_short=True)
 
-        def seeds_of(number: int, gpus: Sequence[int]) -> None:
-            part = part_of(self._machine, gpus[0], count) if gpus else Part()
-            seeds = range(number, self._given.seeds, max(1, count))
-            self._seeds(str(number), trainers, seeds, part)
+        def seeds_of(number: int, part: Part) -> None:
+            self._seeds(str(number), trainers, range(number, self._given.seeds, count), part)
 
-        numbers = range(max(1, count))
-        on_free_gpus(count if count > 1 else None, numbers, lambda _: 1, seeds_of)
+        on_parts(self._machine, count, range(count), seeds_of)
         self._write()
 
     def _seeds(self, name: str, trainers: Sequence[str], seeds: Sequence[int], part: Part) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +14,7 @@ from gmijax.control.console import doing, nearby
 from gmijax.errors import GmijaxError
 from gmijax.machine.interpreter import command
 from gmijax.machine.opengl import (
-    WITHOUT_OPENGL,
+    NO_OPENGL,
     environment_with,
     is_missing,
     opengls,
@@ -32,7 +31,7 @@ def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
         return
     with doing(console, "writing the page"), paths.page_log.open("wb") as log:
         exit_code = run_child(
-            "gmijax.workers.page_writer", paths, {**os.environ, **WITHOUT_OPENGL}, log
+            "gmijax.workers.page_writer", paths, environment_with(NO_OPENGL), log
         )
     if exit_code == 0:
         console.print(f"page: {nearby(paths.html)}")

@@ -5,7 +5,6 @@ A child does it, `gmijax.workers.plain_playback`. No jax and no mujoco here.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +12,7 @@ from gmijax.config import PlayConfig
 from gmijax.config.schema import to_dict
 from gmijax.deploy.pictures import run_child
 from gmijax.errors import ConfigError, GmijaxError
-from gmijax.machine.opengl import WITHOUT_OPENGL
+from gmijax.machine.opengl import NO_OPENGL, environment_with
 from gmijax.player.shipped import require_shipped
 from gmijax.runs.folder import RUNS, PlayPaths, RunPaths, remove_temporary, write_json
 from gmijax.supervise.failures import last_line
@@ -70,7 +69,7 @@ def play(paths: PlayPaths, seconds: float | None = None) -> None:
     own = () if seconds is None else (str(seconds),)
     log = paths.root / "stderr.log"
     with log.open("wb") as output:
-        environment = {**os.environ, **WITHOUT_OPENGL}
+        environment = environment_with(NO_OPENGL)
         code = run_child("gmijax.workers.plain_playback", paths, environment, output, *own)
     if code == 2:
         raise ConfigError(last_line(log))

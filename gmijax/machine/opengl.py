@@ -16,20 +16,20 @@ from gmijax.errors import printable
 from gmijax.machine.interpreter import command
 from gmijax.runs.folder import EXIT_NO_GL
 
-_GL: Final = "MUJOCO_GL"
-WITHOUT_OPENGL: Final = {_GL: "disable"}
-"""For processes that draw nothing: where MUJOCO_GL names what is not installed, importing mujoco
-fails."""
+GL_VARIABLE: Final = "MUJOCO_GL"
+NO_OPENGL: Final = "disable"
+"""Its value for processes that draw nothing: where it names what is not installed, importing
+mujoco fails."""
 
 
 def opengls(*others: str) -> tuple[str, ...]:
     """What to try, in order: the user's MUJOCO_GL, then `others`."""
-    return tuple(dict.fromkeys(filter(None, (os.environ.get(_GL), *others))))
+    return tuple(dict.fromkeys(filter(None, (os.environ.get(GL_VARIABLE), *others))))
 
 
 def environment_with(gl: str) -> dict[str, str]:
     """This process's environment variables, for a child that is to draw with `gl`."""
-    environment = {**os.environ, _GL: gl}
+    environment = {**os.environ, GL_VARIABLE: gl}
     # MuJoCo sets it to what fits MUJOCO_GL, and refuses any other value.
     environment.pop("PYOPENGL_PLATFORM", None)
     return environment
@@ -65,14 +65,14 @@ def first_opengl(tried: Sequence[str], timeout_s: float | None = None) -> tuple[
 def why_no_opengl() -> str | None:
     """Chooses OpenGL for this process, if mujoco is not imported yet; None if it can draw."""
     if "mujoco" in sys.modules:
-        if os.environ.get(_GL) or os.environ.get("DISPLAY"):
+        if os.environ.get(GL_VARIABLE) or os.environ.get("DISPLAY"):
             return None
         return "mujoco was imported before; set MUJOCO_GL=egl (or osmesa) before Python starts"
     tried = opengls("egl", "osmesa")
     gl, said = first_opengl(tried)
     if gl is None:
         return f"{what_is_missing(tried)}; the last one: {said}"
-    os.environ[_GL] = gl
+    os.environ[GL_VARIABLE] = gl
     os.environ.pop("PYOPENGL_PLATFORM", None)
     return None
 

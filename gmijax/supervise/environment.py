@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from gmijax.machine.jax_settings import without_breaking
-from gmijax.machine.opengl import WITHOUT_OPENGL
+from gmijax.machine.opengl import GL_VARIABLE, NO_OPENGL
 from gmijax.machine.xla_on_cpu import POOL, XLA_FLAGS, flags_on_cpu, pool_on_cpu
 from gmijax.partition.plan import Allocation, Plan
 from gmijax.supervise.child import ENV_CPUS, ENV_GMI
@@ -75,7 +75,7 @@ def _common(allocation: Allocation) -> dict[str, str]:
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         # NVLink multicast is unsafe on hosts that are shared with others.
         "NCCL_NVLS_ENABLE": "0",
-        **WITHOUT_OPENGL,
+        GL_VARIABLE: NO_OPENGL,
     }
 
 
