@@ -24,7 +24,7 @@ def main() -> int:
             return 2
         return 0
     found = check.check()
-    sys.stdout.writelines(f"{finding}\n" for finding in found)
+    sys.stdout.writelines(f"{finding}\n" for finding in (*found, check.count()))
     return int(bool(found))
 
 

@@ -7,14 +7,17 @@ empty where a version says nothing new.
 
 from __future__ import annotations
 
+from benchmarks.cases import REWARD
 from benchmarks.evaluation.async_tables import KEYS, LONG
 from benchmarks.evaluation.figures import NOT_MEASURED, bounds, ratio, results_of, shown
+from benchmarks.evaluation.learning_tables import seconds_over_one_process
 from benchmarks.evaluation.other_tables import (
     IMPLS,
     SERVING,
     USE,
     model_fit,
     mps_and_share,
+    mps_over_one,
     mps_over_share,
     serving_rate,
 )
@@ -46,17 +49,14 @@ def claims() -> list[str]:
         templates=bounds([ratio(f"templates-{task}", *TEMPLATES) for task in ("ant", "humanoid")]),
         answers=_answers(),
         several_served=bounds(several, ",.0f"),
+        served_over_one=bounds([mps_over_one(task, n) for task in IMPLS for n in (2, 3, 4, 8)]),
         one_serves=shown(serving_rate(SERVING, "ant 1 x 8192, mps"), ",.0f"),
         fixed_total=bounds([*fixed_total_ratios().values()]),
         best_plans=bounds([*best_plan_ratios().values()]),
         mps={task: bounds([mps_over_share(task, n) for n in (2, 4, 8)]) for task in IMPLS},
-        environments=bounds(
-            [
-                ratio(f"tasks-{impl}", f"{task} {impl} 8192", f"{task} {impl} 2048")
-                for task in ("ant", "humanoid")
-                for impl in ("jax", "warp")
-            ]
-        ),
+        from_512=_more_environments(512, 2048),
+        from_2048=_more_environments(2048, 8192),
+        reward=", ".join(f"{task} {shown(seconds_over_one_process(task))}" for task in REWARD),
         **_reductions(),
         **_asynchronous(),
     )
@@ -70,6 +70,17 @@ def _answers() -> str:
         if (best := results_of(file).get("best"))
     ]
     return ", ".join(answers) or NOT_MEASURED
+
+
+def _more_environments(few: int, many: int) -> str:
+    """Steps/s with many environments in one process over those with few."""
+    return bounds(
+        [
+            ratio(f"tasks-{impl}", f"{task} {impl} {many}", f"{task} {impl} {few}")
+            for task in ("ant", "humanoid")
+            for impl in ("jax", "warp")
+        ]
+    )
 
 
 def _reductions() -> dict[str, dict[str, str]]:
@@ -96,5 +107,6 @@ def _asynchronous() -> dict[str, dict[str, str]]:
         "four": ("async-4gpu", f"{several}, har, batches of 4 agents", one_each),
         "by_host": ("async-4gpu", several, one_each),
         "channels": ("async-channels", "anymal multi", "anymal uni"),
+        "channels_fc": ("async-channels", "franka_cabinet multi", "franka_cabinet uni"),
     }
     return {name: {key: shown(ratio(*pair, key)) for key in KEYS} for name, pair in pairs.items()}

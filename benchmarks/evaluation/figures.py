@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from benchmarks.records import RESULTS, Call, read_calls
@@ -56,6 +56,11 @@ def call_of(file: str) -> Call | None:
         return None
     calls = list(enumerate(read_calls(path)))
     return max(calls, key=lambda one: (_count(one[1].results), one[0]))[1]
+
+
+def measured(files: Iterable[str]) -> list[str]:
+    """Those that there are, each once."""
+    return [file for file in dict.fromkeys(files) if (RESULTS / f"{file}.json").exists()]
 
 
 def results_of(file: str) -> Mapping[str, Any]:
@@ -128,12 +133,17 @@ def look_up(reference: str) -> float:
     Raises:
       ConfigError: no call has it.
     """
+    medians = [statistics.median(found) for found in look_up_all(reference)[1]]
+    return medians[0] / medians[1] if len(medians) > 1 else medians[0]
+
+
+def look_up_all(reference: str) -> tuple[Call, list[list[float]]]:
+    """The call that `look_up` takes, and of each of its paths the values whose median it takes."""
     file, _, rest = reference.partition("#")
     for call in reversed(read_calls(RESULTS / file)):
         values = [list(_at(call.results, path.strip())) for path in rest.split(" over ")]
         if all(values):
-            medians = [statistics.median(found) for found in values]
-            return medians[0] / medians[1] if len(medians) > 1 else medians[0]
+            return call, values
     raise ConfigError(f"{file} has no {rest}")
 
 

@@ -23,10 +23,7 @@ USE, REDUCTION = "resource-use-nvidia-h200", "reduction-nvidia-h200"
 IMPLS = {"ant": "jax", "humanoid": "warp"}
 """Which MJX each task was served with."""
 
-SEARCHES = {
-    **{"search-ant-jax-h200": "jax", "search-ant-one_shot-h200": "warp"},
-    **{"search-ant-warp-7-and-1-h200": "warp", "search-ant-warp-1-h200": "warp"},
-}
+SEARCHES = {"search-ant-jax-h200": "jax", "search-ant-one_shot-h200": "warp"}
 """Files of searches on one GPU, and the MJX that is shown of each."""
 
 
@@ -68,9 +65,17 @@ def backends() -> Rows:
     """MPS against plain sharing."""
     for task in IMPLS:
         for gmis in (2, 3, 4, 8):
-            rates = (shown(value, ",.0f") for value in mps_and_share(task, gmis))
-            size = f"{gmis} x {8192 // gmis:,}"
-            yield [f"`{task}`", size, *rates, shown(mps_over_share(task, gmis)), NOT_MEASURED]
+            if all(found := mps_and_share(task, gmis)):
+                rates = (shown(value, ",.0f") for value in found)
+                size = f"{gmis} x {8192 // gmis:,}"
+                yield [f"`{task}`", size, *rates, shown(mps_over_share(task, gmis)), NOT_MEASURED]
+
+
+def mps_over_one(task: str, gmis: int) -> float | None:
+    """Steps/s of serving in GMIs under MPS over one process, of one call."""
+    several = mps_and_share(task, gmis)[0]
+    one = serving_rate(backends_file(), f"{task} 1 x 8192, mps", IMPLS[task])
+    return several / one if several and one else None
 
 
 SERVING_HEAD = (
@@ -230,16 +235,3 @@ def sm_shares() -> Rows:
         verdict = f"**wrong** ({', '.join(sorted(wrong))})" if wrong else "right"
         rates = [f"{value:.0f}" for value in row["tflops"].values()]
         yield [f"{row['sm_percent']:g}", str(row["num_sms"]), verdict, *rates]
-
-
-@table(
-    "stencil",
-    "grid | backend | four GMIs, us a step: | one process, us: | times slower:",
-    "stencil-nvidia-h200",
-)
-def stencil() -> Rows:
-    """Four GMIs that share a grid against one process."""
-    for run in results_of("stencil-nvidia-h200").get("runs", ()):
-        slower = run["us_per_step"] / run["one_us_per_step"]
-        times = (f"{run[key]:.0f}" for key in ("us_per_step", "one_us_per_step"))
-        yield [run["size"], f"`{run['backend']}`", *times, f"{slower:.2f}"]

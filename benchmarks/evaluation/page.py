@@ -36,6 +36,7 @@ def advice() -> list[str]:
         mps=bounds([*mps_gains().values()]),
         fixed_total=bounds([*fixed_total_ratios().values()]),
         best_plans=bounds([*best_plan_ratios().values()]),
+        two_gpus=shown(over_one_gpu(2)),
         four_gpus=shown(over_one_gpu(4)),
         asynchronous_1=bounds(asynchronous_gains(1)),
         asynchronous_2=bounds(asynchronous_gains(2)),

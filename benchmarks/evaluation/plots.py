@@ -14,7 +14,6 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as Picture
 from matplotlib.transforms import blended_transform_factory
 
-from benchmarks.evaluation.figures import ratio
 from benchmarks.evaluation.other_tables import IMPLS, mps_over_share
 from benchmarks.evaluation.paper import lgr_gain
 from benchmarks.evaluation.sweep_tables import first_gains
@@ -22,6 +21,7 @@ from benchmarks.evaluation.tables import (
     LAYOUTS,
     fixed_total_ratios,
     over_one_gpu,
+    reduction_gain,
     small_gmis,
 )
 from gmijax.runs.folder import write_text
@@ -78,7 +78,7 @@ def lgr() -> Groups:
     for task in ("ant", "humanoid", "shadow_hand"):
         bars = groups.setdefault(task, {})
         for at, name in LAYOUTS.items():
-            bars[name] = ratio(f"lgr-{task}-one_shot", f"{at} one_shot", f"{at} mpr")
+            bars[name] = reduction_gain(task, at, "one_shot")
             bars[f"{name}, {PAPER}"] = lgr_gain(task, at)
     return groups
 

@@ -8,6 +8,7 @@ import json
 import re
 import shlex
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -85,6 +86,25 @@ def test_free_gpus_are_given_back():
         assert all_of_them == (0, 1, 2)
 
 
+def test_who_needs_several_gpus_is_not_passed_by_who_needs_one():
+    free, order = FreeGpus(2), []
+
+    def take(count: int) -> None:
+        with free.taken(count):
+            order.append(count)
+
+    threads = [threading.Thread(target=take, args=(count,)) for count in (2, 1)]
+    with free.taken():
+        for number, thread in enumerate(threads, 1):
+            thread.start()
+            while len(free._waiting) < number:
+                time.sleep(0.001)
+        assert order == []  # One GPU is free, and it is not that thread's turn.
+    for thread in threads:
+        thread.join()
+    assert order == [2, 1]
+
+
 def test_turns_get_as_many_gpus_as_they_need_or_none():
     def run(turn: int, gpus: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
         if turn > 2:
@@ -157,7 +177,7 @@ class Commands:
             (folder / f"{name}.json").write_text(json.dumps(content))
         return 0
 
-    def failure_of(self, command: Sequence[str], folder: Path | None = None) -> None:
+    def failure_of(self, command: Sequence[str], folder: Path | None = None, *_: Any) -> None:
         self.run(command, folder)
 
 

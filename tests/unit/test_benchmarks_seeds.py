@@ -39,7 +39,9 @@ def test_outcomes_are_of_the_jobs_that_ended_wherever_the_sweep_ran(tmp_path: Pa
         run = tmp_path / f"{number:03d}"
         run.mkdir()
         rewards = [1.0] * 20 + [final] * 20
-        lines = [{"env_steps": k, "reward_per_step": reward} for k, reward in enumerate(rewards)]
+        lines = [
+            {"env_steps": k, "wall_s": k, "reward_per_step": one} for k, one in enumerate(rewards)
+        ]
         (run / "metrics.jsonl").write_text("".join(f"{json.dumps(one)}\n" for one in lines))
         job = {"overrides": {"seed": str(number)}, "wall_s": 5.0, "state": state}
         jobs.append({**job, "run_dir": f"/elsewhere/{run.name}"})
