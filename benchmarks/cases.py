@@ -138,9 +138,7 @@ def _sac(gpus: int, batch_size: int) -> Case:
     return _case(
         f"{gpus} GPUs x 4096, batches of {gpus} x {batch_size}",
         f"env=ant algo=sac num_envs=4096 num_timesteps={64 * 16 * 4096 * gpus} plan.gpus={gpus} "
-        f"algo.batch_size={batch_size} algo.updates_per_step=4 algo.precision=bfloat16 "
-        "algo.replay_precision=float16 algo.replay_steps=256 algo.reward_scaling=0.02 "
-        f"{_NO_RATES} {_NO_CHECKPOINTS}",
+        f"algo.batch_size={batch_size} {_NO_RATES} {_NO_CHECKPOINTS}",
         gpus,
     )
 

@@ -23,8 +23,8 @@ from benchmarks.cases import SUITES, Case
 from benchmarks.evaluation.figures import RATES, Figure, figure, over, shown
 from benchmarks.evaluation.writer import markdown
 from benchmarks.free_gpus import on_free_gpus
-from benchmarks.records import ResultsFile
 from benchmarks.outcomes import return_curve
+from benchmarks.records import ResultsFile
 from benchmarks.runner import (
     STOP_S,
     as_word,
@@ -40,7 +40,7 @@ from gmijax.runs.history import read_metrics
 
 
 def main() -> int:
-    """Runs what the command line asks for; returns 1 if a run failed, else 0."""
+    """Runs what the command line asks for; returns 1 if a run failed or had no time, else 0."""
     given = _options()
     files = [
         (cases, _file(suite, cases, given))
@@ -65,7 +65,10 @@ def main() -> int:
         on_free_gpus(given.gpus or None, turns, lambda turn: turn.case.gpus, _Turn.run)
     for _, file in files:
         print(*table(file.results), f"written: {file.path}", sep="\n")
-    return int(any(failures(file.results) for _, file in files))
+    left = sum(not is_done(turn.file.results, turn.case, turn.repeat) for turn in turns)
+    if left:
+        sys.stderr.write(f"{left} of {len(turns)} runs failed or had no time: see --resume\n")
+    return int(bool(left))
 
 
 def _file(suite: str, cases: Sequence[Case], given: argparse.Namespace) -> ResultsFile:
@@ -155,16 +158,6 @@ def median(lines: Sequence[Mapping[str, Any]], key: str) -> float | None:
     """Over the lines that have a value; None of nothing."""
     found = [line[key] for line in lines if line.get(key) is not None]
     return statistics.median(found) if found else None
-
-
-def failures(results: Mapping[str, Any]) -> list[str]:
-    """Names of the cases of which a repeat failed, and did not succeed later."""
-    return [
-        name
-        for name, case in results["cases"].items()
-        if {run["repeat"] for run in case["runs"]}
-        - {run["repeat"] for run in case["runs"] if "summary" in run}
-    ]
 
 
 def table(results: Mapping[str, Any]) -> list[str]:

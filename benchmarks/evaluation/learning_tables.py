@@ -145,7 +145,7 @@ def _of_algorithms() -> Calls:
 
 @table_of_calls(
     "returns",
-    "task | trained by | million steps: | seeds: | successes: | return at the end: | mark: | "
+    "task | trained by | million steps: | successes: | return at the end: | mark: | "
     "seeds that reach it: | seconds of training to it:",
     _of_algorithms,
 )
@@ -155,17 +155,20 @@ def returns(calls: Calls) -> Rows:
         rows = [row for row in call.results["rows"] if row["seeds"]]
         mark = NEARLY * rows[0]["return"][1] if rows and rows[0]["return"] else None
         for row in rows:
-            curves = [one["curve"] for one in row["each"] if one["curve"]]
-            steps = bounds([curve[-1][0] / 1e6 for curve in curves], ".0f")
-            final = figure([o["final_return"] for o in row["each"] if o["final_return"] is not None])
-            times = [] if mark is None else [seconds_to(mark, curve) for curve in curves]
-            reached = figure([s for s in times if s is not None])
-            of = str(row["seeds"])
-            successes, reach = f"{row['successes']} of {of}", f"{reached and reached.repeats or 0}"
-            yield [
-                *(f"`{task}`", row["row"], steps, of, successes, shown(final, ",.4g")),
-                *(shown(mark, ",.4g"), f"{reach} of {of}", shown(reached, ".0f")),
-            ]
+            yield _beside(task, row, mark)
+
+
+def _beside(task: str, row: Mapping[str, Any], mark: float | None) -> list[str]:
+    """Cells of an algorithm: what its seeds reach, and how many of them the mark, and when."""
+    curves = [one["curve"] for one in row["each"] if one["curve"]]
+    finals = [one["final_return"] for one in row["each"] if one["final_return"] is not None]
+    times = [] if mark is None else [seconds_to(mark, curve) for curve in curves]
+    reached, seeds = [s for s in times if s is not None], row["seeds"]
+    return [
+        *(f"`{task}`", row["row"], bounds([curve[-1][0] / 1e6 for curve in curves], ".0f")),
+        *(f"{row['successes']} of {seeds}", shown(figure(finals), ",.4g"), shown(mark, ",.4g")),
+        *(f"{len(reached)} of {seeds}", shown(figure(reached), ".0f")),
+    ]
 
 
 @table(

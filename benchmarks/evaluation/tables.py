@@ -205,9 +205,7 @@ def algorithm_1(at: str) -> str:
 
 def with_and_without(task: str, at: str, way: str) -> tuple[Figure | None, Figure | None]:
     """Steps/s of a reduction on a layout, and of `mpr`: of the same call where that has both."""
-    pairs = [
-        (rate(file, f"{at} {way}"), rate(file, f"{at} mpr")) for file in measured(_lgr(task))
-    ]
+    pairs = [(rate(file, f"{at} {way}"), rate(file, f"{at} mpr")) for file in measured(_lgr(task))]
     own, mpr = ([one for one in side if one] for side in zip(*pairs, strict=True))
     alone = (own[0] if own else None, mpr[0] if mpr else None)
     return next((pair for pair in pairs if all(pair)), alone)

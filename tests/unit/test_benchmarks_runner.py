@@ -15,13 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from supervision import machine
+from supervision import MPS, machine
 
 from benchmarks import records, runner
+from benchmarks.cases import SUITES
 from benchmarks.free_gpus import FreeGpus, on_free_gpus
 from benchmarks.records import read_calls
 from benchmarks.runner import exit_code, failure_of, in_turn, start, wait_until
+from gmijax.cli.compose import compose
 from gmijax.errors import ConfigError
+from gmijax.supervise.job_kinds import training_plan
 
 
 @pytest.fixture(autouse=True)
@@ -310,8 +313,8 @@ def test_only_what_has_not_succeeded_is_run_again(tmp_path: Path, monkeypatch: p
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
-        (["ant-1gpu", "--only", "none"], "--only 'none': no case of these suites has that in"),
-        (["ant-2gpu", "--gpus", "1"], "--gpus 1: every case of these suites needs more"),
+        (["reward", "--only", "none"], "--only 'none': no case of these suites has that in"),
+        (["async-channels", "--gpus", "1"], "--gpus 1: every case of these suites needs more"),
     ],
 )
 def test_a_suite_without_a_case_to_run_is_refused(
@@ -324,6 +327,26 @@ def test_a_suite_without_a_case_to_run_is_refused(
     monkeypatch.setattr(sys, "argv", ["run", "--out", str(tmp_path), *arguments])
     assert exit_code(importlib.import_module("benchmarks.run").main) == 2
     assert capsys.readouterr().err.startswith(error)
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_every_case_has_a_plan(suite: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("gmijax.partition.reduction.is_installed", lambda *_: True)
+    for case in SUITES[suite]:
+        gpus = f"plan.gpus=[{','.join(map(str, range(case.gpus)))}]"  # As `--gpus` has it.
+        for more in ((), (gpus,)):
+            config = compose(*(text.format(run=0) for text in case.overrides), *more)
+            plan = training_plan(config, machine(case.gpus, mps_control=MPS))
+            assert plan.layout.num_gpus == case.gpus
+
+
+def test_what_would_not_end_before_the_deadline_is_not_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    commands = Commands()
+    assert run_benchmark("run", tmp_path, monkeypatch, commands, "--deadline-s", "1") == 1
+    assert commands.made == []
+    assert capsys.readouterr().err == "1 of 1 runs failed or had no time: see --resume\n"
 
 
 class Taken(Exception):
