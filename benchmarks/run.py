@@ -4,7 +4,8 @@
 the medians, and adds a call with every run in it to `benchmarks/results/<suite>.json`. With
 `--gpus 4` as many runs go on at a time as there are GPUs for, each alone on its own. With
 `--deadline-s` runs that would not end in time are not started. `--resume` goes on with the last
-call, if code and machine are still the same.
+call, if code and machine are still the same. With `--gpus` NVML says which part of their SMs was
+busy (Hopper and newer).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks.busy_sms import BusySms
 from benchmarks.cases import SUITES, Case
 from benchmarks.evaluation.figures import RATES, Figure, figure, over, shown
 from benchmarks.evaluation.writer import markdown
@@ -105,7 +107,10 @@ class _Turn(NamedTuple):
         name = f"{self.file.suite}-{as_word(self.case.name)}-{self.repeat}"
         folder = unused(self.runs / name)
         own = (f"plan.gpus=[{','.join(map(str, gpus))}]",) if gpus else ()
-        done = run_case(self.case, self.repeat, (*own, f"run.dir={folder}"), folder)
+        with BusySms(gpus) as busy:
+            done = run_case(self.case, self.repeat, (*own, f"run.dir={folder}"), folder)
+        if "summary" in done:
+            done["busy_sms"] = busy.between(*training_of(folder))
         with self.file.changing() as results:
             kept = results["cases"][self.case.name]
             kept["config"] = done.pop("config", kept.get("config"))
@@ -152,6 +157,13 @@ def outcome(folder: Path) -> dict[str, Any]:
         "diverged_steps": sum(line["diverged_steps"] for line in lines),
         "medians": {name: median(lines, name) for name in names},
     }
+
+
+def training_of(folder: Path) -> tuple[float, float]:
+    """When a run had made its first iteration, and its last: seconds of `time.time`."""
+    path = RunPaths(folder).metrics
+    lines, end_s = read_metrics(path), path.stat().st_mtime
+    return end_s - (lines[-1]["wall_s"] - lines[0]["wall_s"]), end_s
 
 
 def median(lines: Sequence[Mapping[str, Any]], key: str) -> float | None:

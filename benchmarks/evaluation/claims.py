@@ -27,6 +27,7 @@ from benchmarks.evaluation.tables import (
     TEMPLATES,
     algorithm_1,
     best_plan_ratios,
+    busy_in_jobs,
     fixed_total_ratios,
     reduction_gain,
 )
@@ -42,6 +43,8 @@ def claims() -> list[str]:
     return filled(
         "claims",
         busy=bounds([stage["sm"] for use in uses.values() for stage in use.values()], ".0%"),
+        busy_one=bounds(busy_in_jobs(several=False), ".0%"),
+        busy_several=bounds(busy_in_jobs(several=True), ".0%"),
         model_fit=model_fit(),
         serving_templates=bounds(
             [one["colocated"] / one["dedicated"] for one in served if "dedicated" in one]

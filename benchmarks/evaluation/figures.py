@@ -80,6 +80,12 @@ def summaries(file: str, case: str) -> list[Mapping[str, Any]]:
     return [run["summary"] for run in runs if "summary" in run]
 
 
+def busy_sms(file: str, case: str) -> Figure | None:
+    """Part of the SMs that were busy in the runs of a case, 0 to 1."""
+    runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
+    return figure([run["busy_sms"] for run in runs if run.get("busy_sms") is not None])
+
+
 def ratio(file: str, case: str, base: str, key: str = TRAINING) -> float | None:
     """Median of `case` over that of `base`: of one call, so of one machine."""
     return over(rate(file, case, key), rate(file, base, key))

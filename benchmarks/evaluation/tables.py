@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import product
 
 from benchmarks.cases import PLANS, TASKS
 from benchmarks.evaluation.figures import (
     Figure,
+    busy_sms,
     figure,
     measured,
     over,
@@ -184,6 +186,36 @@ def over_one_gpu(gpus: int) -> float | None:
     """Steps/s of several GPUs with one GMI on each, over those of one GPU."""
     gains = (ratio(file, scaling(gpus, 1), scaling(1, 1)) for file in WEAK)
     return next((gain for gain in gains if gain), None)
+
+
+def _jobs_of_one_gpu() -> Iterator[tuple[str, str, str, str]]:
+    """Task, GMIs and environments, file, case: of one process first."""
+    for gmis in (1, 2, 4):
+        yield "ant", f"{gmis} x {8192 // gmis:,}", SCALING, scaling(1, gmis)
+    for task in TASKS:
+        for gmis, num_envs in PLANS:
+            yield task, f"{gmis} x {num_envs:,}", "plans", f"{task} {gmis} x {num_envs}"
+
+
+def busy_in_jobs(*, several: bool) -> list[float | None]:
+    """Part of the SMs that trainings of one GPU keep busy, in one process or in several GMIs."""
+    return [
+        found and found.median
+        for _, size, file, case in _jobs_of_one_gpu()
+        if size.startswith("1 x") != several and (found := busy_sms(file, case))
+    ]
+
+
+@table(
+    "busy-jobs",
+    "training | GMIs x environments | steps/s: | SMs busy:",
+    more=lambda: measured(file for _, _, file, case in _jobs_of_one_gpu() if busy_sms(file, case)),
+)
+def busy_jobs() -> Rows:
+    """What whole trainings take of a GPU."""
+    for task, size, file, case in _jobs_of_one_gpu():
+        if busy := busy_sms(file, case):
+            yield [f"`{task}`", size, shown(rate(file, case), ",.0f"), shown(busy, ".0%")]
 
 
 @table(

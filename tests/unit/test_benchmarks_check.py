@@ -11,6 +11,7 @@ import pytest
 from benchmarks.cases import SUITES
 from benchmarks.evaluation import check, tables
 from benchmarks.evaluation.async_tables import over_the_same_ratio
+from benchmarks.evaluation.count import of_figure, of_table
 from benchmarks.evaluation.figures import look_up
 from benchmarks.evaluation.page import TABLES
 from gmijax.errors import ConfigError
@@ -137,6 +138,43 @@ def test_free_gmis_are_compared_with_one_program_of_their_ratio():
         "two_gmis": {"free_rounds_per_s": 50.0, "free_updates_per_s": 100.0},
     }
     assert over_the_same_ratio(repeat) == pytest.approx(1.5)
+
+
+HEAD = "| task | environments | steps/s | ratio |\n| --- | ---: | ---: | ---: |\n"
+KNOWN = "- [`a.json`](a): commit 1234567, 2026-11-27, 1 x NVIDIA H200"
+UNKNOWN = "- [`b.json`](b): commit unknown, date unknown, NVIDIA H200, 3 runs of each case"
+
+
+@pytest.mark.parametrize(
+    ("rows", "sources", "counted"),
+    [
+        # Environments are no figure; a ratio is of as many runs as what it is of.
+        (["| ant | 8 | 5 (4 to 6, n=3) | 1.2 |"], [KNOWN], (2, 2)),
+        (["| ant | 8 | 5 (4 to 6, n=2) | 1.2 |"], [KNOWN], (2, 0)),
+        (["| ant | 8 | 5 | 1.2 |"], [KNOWN], (2, 0)),
+        (["| ant | 8 | 5 | 1.2 |"], [f"{KNOWN}, 3 runs of each case"], (2, 2)),
+        (["| ant | 8 | 5 | 1.2 |"], [f"{KNOWN}, 1 to 3 runs of each case"], (2, 0)),
+        (["| ant | 8 | 5 of 20 | not measured |"], [KNOWN], (1, 1)),
+        (["| ant | 8 | 5 | 1.2 |"], [UNKNOWN], (2, 0)),
+        # A row may say which file it is from.
+        (
+            ["| `b` | 8 | 5 (4 to 6, n=3) |  |", "| `a` | 8 | 5 (4 to 6, n=3) |  |"],
+            [KNOWN, UNKNOWN],
+            (2, 1),
+        ),
+    ],
+)
+def test_figures_are_counted(rows: list[str], sources: list[str], counted: tuple[int, int]):
+    text = HEAD + "\n".join([*rows, "", *sources]) + "\n"
+    assert of_table("any", text) == counted
+    assert of_table("node-scaling", text) == (0, 0)
+
+
+def test_marked_figures_are_counted():
+    assert of_figure("sac-ant.json#2 updates, one program/step_per_s_train") == (1, 1)
+    assert of_figure("sac-humanoid.json#4 updates, one program/step_per_s_train") == (1, 0)
+    assert of_figure(REFERENCE) == (1, 0)  # Without a commit.
+    assert of_figure("none.json#a") == (1, 0)
 
 
 def test_results_without_a_commit_are_planned_again(tmp_path: Path):
