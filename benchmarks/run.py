@@ -1,6 +1,6 @@
 """Runs suites of training commands and keeps what they measured.
 
-`python -m benchmarks.run ant-1gpu --repeats 3` runs the cases in turn (A B C A B C ...), prints
+`python -m benchmarks.run scaling --repeats 3` runs the cases in turn (A B C A B C ...), prints
 the medians, and adds a call with every run in it to `benchmarks/results/<suite>.json`. With
 `--gpus 4` as many runs go on at a time as there are GPUs for, each alone on its own. With
 `--deadline-s` runs that would not end in time are not started. `--resume` goes on with the last
@@ -119,8 +119,10 @@ class _Turn(NamedTuple):
             kept["runs"].append({**done, "repeat": self.repeat, "command_s": command_s})
 
     def _longest_s(self) -> float:
-        """That a run of this case took in this call, 0 before the first."""
-        runs = self.file.results["cases"][self.case.name]["runs"]
+        """That a run of this case took in this call, before the first that one of any case did."""
+        cases = self.file.results["cases"]
+        mine = cases[self.case.name]["runs"]
+        runs = mine or [run for case in cases.values() for run in case["runs"]]
         return max((run["command_s"] for run in runs), default=0.0)
 
 

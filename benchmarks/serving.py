@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.evaluation.other_tables import SERVING_HEAD, serving_row
+from benchmarks.evaluation.serving_tables import SERVING_HEAD, serving_row
 from benchmarks.evaluation.writer import markdown
 from benchmarks.free_gpus import Part, on_parts
 from benchmarks.records import results_file

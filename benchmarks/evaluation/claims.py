@@ -11,17 +11,16 @@ from benchmarks.cases import REWARD
 from benchmarks.evaluation.async_tables import KEYS, LONG
 from benchmarks.evaluation.figures import NOT_MEASURED, bounds, ratio, results_of, shown
 from benchmarks.evaluation.learning_tables import seconds_over_one_process
-from benchmarks.evaluation.other_tables import (
-    IMPLS,
-    SERVING,
-    USE,
-    model_fit,
-    mps_and_share,
+from benchmarks.evaluation.other_tables import USE, model_fit
+from benchmarks.evaluation.paper import LGR, lgr_gain
+from benchmarks.evaluation.serving_tables import (
+    GMIS,
     mps_over_one,
     mps_over_share,
     serving_rate,
+    templates_gains,
 )
-from benchmarks.evaluation.paper import LGR, lgr_gain
+from benchmarks.evaluation.serving_tables import TASKS as SERVED
 from benchmarks.evaluation.tables import (
     LAYOUTS,
     TEMPLATES,
@@ -38,25 +37,21 @@ from benchmarks.evaluation.writer import filled, lines
 def claims() -> list[str]:
     """What both versions of the paper claim, and what was measured here."""
     uses = results_of(USE).get("tasks", {})
-    served = results_of(SERVING).get("cases", ())
-    several = [mps_and_share("ant", gmis)[0] for gmis in (2, 4, 8)]
+    rates = [rate.median for n in GMIS if (rate := serving_rate("ant", n))]
     return filled(
         "claims",
         busy=bounds([stage["sm"] for use in uses.values() for stage in use.values()], ".0%"),
         busy_one=bounds(busy_in_jobs(several=False), ".0%"),
         busy_several=bounds(busy_in_jobs(several=True), ".0%"),
         model_fit=model_fit(),
-        serving_templates=bounds(
-            [one["colocated"] / one["dedicated"] for one in served if "dedicated" in one]
-        ),
+        serving_templates=bounds(templates_gains()),
         templates=bounds([ratio(f"templates-{task}", *TEMPLATES) for task in ("ant", "humanoid")]),
         answers=_answers(),
-        several_served=bounds(several, ",.0f"),
-        served_over_one=bounds([mps_over_one(task, n) for task in IMPLS for n in (2, 3, 4, 8)]),
-        one_serves=shown(serving_rate(SERVING, "ant 1 x 8192, mps"), ",.0f"),
+        served=bounds(rates, ",.0f"),
+        served_over_one=bounds([mps_over_one(task, n) for task in SERVED for n in GMIS]),
         fixed_total=bounds([*fixed_total_ratios().values()]),
         best_plans=bounds([*best_plan_ratios().values()]),
-        mps={task: bounds([mps_over_share(task, n) for n in (2, 4, 8)]) for task in IMPLS},
+        mps={task: bounds([mps_over_share(task, n) for n in GMIS]) for task in SERVED},
         from_512=_more_environments(512, 2048),
         from_2048=_more_environments(2048, 8192),
         reward=", ".join(f"{task} {shown(seconds_over_one_process(task))}" for task in REWARD),

@@ -14,8 +14,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as Picture
 from matplotlib.transforms import blended_transform_factory
 
-from benchmarks.evaluation.other_tables import IMPLS, mps_over_share
 from benchmarks.evaluation.paper import lgr_gain
+from benchmarks.evaluation.serving_tables import TASKS, mps_over_share
 from benchmarks.evaluation.sweep_tables import first_gains
 from benchmarks.evaluation.tables import (
     LAYOUTS,
@@ -58,7 +58,7 @@ def summary() -> Groups:
 
 def mps_gains() -> Bars:
     """Serving under MPS over plain sharing, with the fewest and the most GMIs."""
-    return {f"{task}, {n} GMIs": mps_over_share(task, n) for task in IMPLS for n in (2, 8)}
+    return {f"{task}, {n} GMIs": mps_over_share(task, n) for task in TASKS for n in (2, 8)}
 
 
 def one_training() -> Bars:
