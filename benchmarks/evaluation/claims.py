@@ -11,7 +11,7 @@ from benchmarks.cases import REWARD
 from benchmarks.evaluation.async_tables import KEYS, LONG
 from benchmarks.evaluation.figures import NOT_MEASURED, bounds, ratio, results_of, shown
 from benchmarks.evaluation.learning_tables import seconds_over_one_process
-from benchmarks.evaluation.other_tables import USE, model_fit
+from benchmarks.evaluation.other_tables import USE, answers, model_fit
 from benchmarks.evaluation.paper import LGR, lgr_gain
 from benchmarks.evaluation.serving_tables import (
     GMIS,
@@ -61,13 +61,12 @@ def claims() -> list[str]:
 
 
 def _answers() -> str:
-    """What the searches on one GPU chose for ant."""
-    answers = [
-        f"{best['gmis_per_gpu']} x {best['num_envs']:,} ({best['impl']})"
-        for file in ("search-ant-jax-h200", "search-ant-one_shot-h200")
-        if (best := results_of(file).get("best"))
-    ]
-    return ", ".join(answers) or NOT_MEASURED
+    """What the searches on one GPU chose."""
+    found = (
+        f"{task} {best['gmis_per_gpu']} x {best['num_envs']:,} ({best['impl']})"
+        for task, best in ((task, row["best"]) for task, row in answers().items())
+    )
+    return ", ".join(found) or NOT_MEASURED
 
 
 def _more_environments(few: int, many: int) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from benchmarks import node_scaling as scaling
@@ -22,12 +23,9 @@ from benchmarks.evaluation.writer import (
     table,
     table_of_calls,
 )
-from benchmarks.records import RESULTS, read_calls
+from benchmarks.records import RESULTS, Call, calls_by_date, read_calls
 
 USE = "resource-use-nvidia-h200"
-
-SEARCHES = {"search-ant-jax-h200": "jax", "search-ant-one_shot-h200": "warp"}
-"""Files of searches on one GPU, and the MJX that is shown of each."""
 
 
 @table("resource-use", "task | stage | time in an iteration, ms: | SMs busy: | memory:", USE)
@@ -40,20 +38,42 @@ def resource_use() -> Rows:
             yield [f"`{task}`", stage, *cells]
 
 
-@table("search", "search | MJX | GMIs x environments | steps/s of the GPU: |", *SEARCHES)
-def search() -> Rows:
-    """Points of the searches: GMIs and environments of each."""
-    for file, impl in SEARCHES.items():
-        results = results_of(file)
-        for p in results.get("points", ()):
-            if p["impl"] == impl and p.get("projected"):
-                best = "**answer**" if _is_answer(p, results["best"]) else ""
-                size = f"{p['gmis_per_gpu']} x {p['num_envs']:,}"
-                yield [f"`{file}`", impl, size, f"{p['projected']:,.0f}", best]
+def _searches() -> Calls:
+    """By task, the newest call that searched it."""
+    found: dict[str, tuple[Call, Path]] = {}
+    for call, path in calls_by_date("search*.json"):
+        rows = call.results.get("rows") or [call.results]  # An old file is one search.
+        found |= {row["env"]: (call, path) for row in rows if "best" in row}
+    return found
 
 
-def _is_answer(point: dict[str, Any], best: dict[str, Any]) -> bool:
-    return all(point[key] == best[key] for key in ("gmis_per_gpu", "num_envs", "impl"))
+def answers() -> dict[str, Mapping[str, Any]]:
+    """What the newest search of each task found."""
+    rows = {}
+    for task, (call, _) in sorted(_searches().items()):
+        searched = call.results.get("rows") or [call.results]
+        rows[task] = next(row for row in searched if row.get("env") == task)
+    return rows
+
+
+@table_of_calls(
+    "search",
+    "task | answer: GMIs x environments | MJX | its steps/s: | over the best point: | "
+    "over the best point with one GMI: | profiles: | seconds:",
+    _searches,
+)
+def search(_: Calls) -> Rows:
+    """What Algorithm 2 chooses, beside the points that it measured."""
+    for task, row in answers().items():
+        best, points = row["best"], [p for p in row["points"] if p.get("projected")]
+        alone = [p["projected"] for p in points if p["gmis_per_gpu"] == 1]
+        yield [
+            *(f"`{task}`", f"{best['gmis_per_gpu']} x {best['num_envs']:,}", best["impl"]),
+            f"{best['projected']:,.0f}",
+            shown(best["projected"] / max(p["projected"] for p in points)),
+            shown(best["projected"] / max(alone) if alone else None),
+            *(str(len(row["points"])), f"{row['wall_s']:.0f}"),
+        ]
 
 
 REDUCTION_HEAD = (

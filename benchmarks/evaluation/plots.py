@@ -22,7 +22,6 @@ from benchmarks.evaluation.tables import (
     fixed_total_ratios,
     over_one_gpu,
     reduction_gain,
-    small_gmis,
 )
 from gmijax.runs.folder import write_text
 
@@ -37,16 +36,11 @@ PAPER = "paper"
 
 def summary() -> Groups:
     """What several GMIs on a GPU gain and lose, in the order of the advice."""
-    small = small_gmis()
     return {
         "small training runs at once, over one after another": {
             way.removesuffix(", auto"): gain.median
             for way, gain in first_gains().items()
             if way.endswith(", auto")
-        },
-        "GMIs of one small training run, over one such GMI": {
-            f"{gmis} GMIs": small[gmis] / small[1] if {1, gmis} <= small.keys() else None
-            for gmis in (4, 10)
         },
         "serving under MPS, over plain sharing": mps_gains(),
         "one large training run in several GMIs, over one process": one_training(),

@@ -70,7 +70,6 @@ BACKENDS = (
 IN_GPU_MEMORY = ("one_shot", "auto")
 """Exchanges that do not pass the host: `auto` where a file does not say what it became."""
 
-SMALL = "search-ant-one_shot-h200"
 TEMPLATES = ("2 GMIs x 2048, tcg_ex", "2 + 1 GMIs x 2048, tdg_ex")
 
 
@@ -287,28 +286,3 @@ def num_env() -> Rows:
                 found = rate(file, name), rate(file, name, "device/peak_memory_mib")
                 if all(found):
                     yield [f"`{task}`", f"{envs:,}", impl, *(shown(one, ",.0f") for one in found)]
-
-
-def small_gmis() -> dict[int, float]:
-    """Steps/s of a GPU by the number of GMIs with 2,048 environments each, MJX-Warp."""
-    return {
-        point["gmis_per_gpu"]: point["projected"]
-        for point in results_of(SMALL).get("points", ())
-        if (point["impl"], point["num_envs"]) == ("warp", 2048)
-    }
-
-
-@table(
-    "many-small",
-    "GMIs x environments each, ant, MJX-Warp | steps/s of the GPU: | over one:",
-    SMALL,
-)
-def many_small() -> Rows:
-    """What a GPU makes of several small processes."""
-    rates = small_gmis()
-    for gmis, value in sorted(rates.items()):
-        yield [
-            f"{gmis} x 2,048",
-            f"{value:,.0f}",
-            shown(value / rates[1] if 1 in rates else None),
-        ]

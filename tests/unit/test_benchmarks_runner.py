@@ -162,7 +162,8 @@ class Commands:
         (place,) = (word for word in command if word.startswith(("run.dir=", "run.name=")))
         key, _, name = place.partition("=")
         folder = Path(name) if key == "run.dir" else given[0] / "runs" / name
-        self.made.append([word for word in command if word != place][1:])
+        scratch = (place, f"search.store={folder.parent}")
+        self.made.append([word for word in command if word not in scratch][1:])
         if len(self.made) - 1 in self.failing:
             raise KeyboardInterrupt
         job = folder / "000"
@@ -176,6 +177,7 @@ class Commands:
             ("summary", {**SUMMARY, "step_per_s_inference": 2.0, "stages_ms": STAGES}),
             ("sweep", report),
             ("pack", report),
+            ("search", {"env": "ant", "best": {"num_envs": 64}, "wall_s": 5.0}),
         ):
             (folder / f"{name}.json").write_text(json.dumps(content))
         return 0
@@ -228,6 +230,11 @@ BENCHMARKS: dict[str, tuple[list[str], str, list[list[str]]]] = {
             ]
             for count in (2, 1)
         ],
+    ),
+    "searches": (
+        ["--tasks", "ant", "--", "search.budget_s=60"],
+        "searches-cpu",
+        [["-m", "gmijax.search", "env=ant", "search.budget_s=60"]],
     ),
     "serving": (
         ["--tasks", "ant", "--simulators", "2", "--templates", "tdg"],
