@@ -65,6 +65,12 @@ def several_learners() -> Rows:
         ]
 
 
+def learners_over_one() -> list[float | None]:
+    """Steps/s of learners on two GPUs over one, of every case."""
+    base, *others = (one.name for one in SUITES[LEARNERS])
+    return [ratio(LEARNERS, case, base) for case in others]
+
+
 def _drawn(case: str) -> Figure | None:
     """Transitions that all learners of a case draw from their replays in a second."""
     config = results_of(LEARNERS).get("cases", {}).get(case, {}).get("config")

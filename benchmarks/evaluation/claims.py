@@ -8,7 +8,7 @@ empty where a version says nothing new.
 from __future__ import annotations
 
 from benchmarks.cases import REWARD
-from benchmarks.evaluation.async_tables import KEYS, LONG
+from benchmarks.evaluation.async_tables import KEYS, LONG, learners_over_one
 from benchmarks.evaluation.figures import NOT_MEASURED, bounds, ratio, results_of, shown
 from benchmarks.evaluation.learning_tables import seconds_over_one_process
 from benchmarks.evaluation.other_tables import USE, answers, model_fit
@@ -54,6 +54,7 @@ def claims() -> list[str]:
         mps={task: bounds([mps_over_share(task, n) for n in GMIS]) for task in SERVED},
         from_512=_more_environments(512, 2048),
         from_2048=_more_environments(2048, 8192),
+        learners=bounds(learners_over_one()),
         reward=", ".join(f"{task} {shown(seconds_over_one_process(task))}" for task in REWARD),
         **_reductions(),
         **_asynchronous(),

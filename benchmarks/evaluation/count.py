@@ -20,7 +20,16 @@ LEAST = 3
 SETTINGS = frozenset(
     (
         *("environments", "GPUs", "steps", "million steps", "call", "cap, %", "SMs", "kinds"),
-        *("sweeps", "seeds", "return", "mark", "MIG", "Isaac Gym, on an A100", "model"),
+        *(
+            "sweeps",
+            "seeds",
+            "profiles",
+            "return",
+            "mark",
+            "MIG",
+            "Isaac Gym, on an A100",
+            "model",
+        ),
         *("at the end: million steps", "faults"),
     )
 )
