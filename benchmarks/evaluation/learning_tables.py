@@ -152,18 +152,22 @@ def _of_algorithms() -> Calls:
 def returns(calls: Calls) -> Rows:
     """What algorithms reach beside the first one, whose nine tenths are the mark of a task."""
     for task, (call, _) in sorted(calls.items()):
-        rows = [row for row in call.results["rows"] if row["seeds"]]
+        rows = call.results["rows"]
         mark = NEARLY * rows[0]["return"][1] if rows and rows[0]["return"] else None
         for row in rows:
             yield _beside(task, row, mark)
 
 
 def _beside(task: str, row: Mapping[str, Any], mark: float | None) -> list[str]:
-    """Cells of an algorithm: what its seeds reach, and how many of them the mark, and when."""
-    curves = [one["curve"] for one in row["each"] if one["curve"]]
-    finals = [one["final_return"] for one in row["each"] if one["final_return"] is not None]
+    """Cells of an algorithm: what its seeds reach, and how many of them the mark, and when.
+
+    Seeds that were stopped count as they were then.
+    """
+    runs, seeds = [*row["each"], *row["cut"]], row["seeds"] + row["unfinished"]
+    curves = [one["curve"] for one in runs if one["curve"]]
+    finals = [one["final_return"] for one in runs if one["final_return"] is not None]
     times = [] if mark is None else [seconds_to(mark, curve) for curve in curves]
-    reached, seeds = [s for s in times if s is not None], row["seeds"]
+    reached = [s for s in times if s is not None]
     return [
         *(f"`{task}`", row["row"], bounds([curve[-1][0] / 1e6 for curve in curves], ".0f")),
         *(f"{row['successes']} of {seeds}", shown(figure(finals), ",.4g"), shown(mark, ",.4g")),

@@ -46,7 +46,8 @@ def _case(task: str, gmis: int, backend: str) -> Case | None:
 def serving_rate(task: str, gmis: int, backend: str = "mps") -> Figure | None:
     """Steps/s of serving in GMIs that share 8192 environments."""
     case = _case(task, gmis, backend)
-    return case and figure([run["step_per_s_inference"] for run in case["runs"]["tcg"]])
+    runs = case["runs"]["tcg"] if case else ()
+    return figure([run["step_per_s_inference"] for run in runs])
 
 
 def mps_over_share(task: str, gmis: int) -> float | None:

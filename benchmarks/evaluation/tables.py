@@ -37,7 +37,7 @@ def scaling(gpus: int, gmis: int) -> str:
 ONE_GPU = (
     *(
         (f"{gmis} GMIs, MJX-Warp", file, scaling(1, gmis), scaling(1, 1))
-        for file in WEAK
+        for file in (SCALING, "scaling-one_shot")
         for gmis in (2, 4)
     ),
     ("2 GMIs, MJX-Warp", TWO_TREES, "2x4096", "1x8192"),
