@@ -132,7 +132,7 @@ def walking(calls: Calls) -> Rows:
 
 
 def seconds_until_it_walks(task: str) -> Figure | None:
-    """Seconds of training by SAC in the newest call, programs compiled before; None if one fails."""
+    """Seconds of training by SAC in the newest call, compiled before; None if one fails."""
     calls = newest("walking-*-nvidia-*.json", _kind_of_walking)
     for (of, algo, _, is_cold), (call, _) in calls.items():
         if (of, algo, is_cold) == (task, "SAC", False):
