@@ -133,5 +133,5 @@ def _restored(like: jax.Array, leaf: np.ndarray) -> jax.Array:
     if like.size == 0:
         return like
     if _is_key(like):
-        return jax.random.wrap_key_data(leaf)
+        return jax.random.wrap_key_data(jnp.array(leaf))
     return jnp.array(leaf.astype(like.dtype))
