@@ -93,6 +93,8 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
     was = saved_config(run.checkpoint(0))
     require_known_keys(was, shown)
     found = newest_checkpoint(folder)
+    # Keys that its version did not have are as they were without.
+    was |= {"env": to_dict(env), "algo": to_dict(algo)}
     changes = differences(was, to_dict(config))
     notes = (*found.passed_over, *(f"changed since the run: {text}" for text in changes))
     if found.checkpoint is None:

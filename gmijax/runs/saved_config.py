@@ -88,7 +88,7 @@ def differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> list[str
       config: that of the job.
     """
     # As both are after a round trip through JSON.
-    before, now = flatten(saved), flatten(json.loads(json.dumps(config)))
+    before, now = (flatten(json.loads(json.dumps(one))) for one in (saved, config))
     return [
         f"{key} is {now.get(key)!r}, was {before.get(key)!r}"
         for key in dict.fromkeys((*now, *before))
