@@ -34,7 +34,7 @@ def save(folder: Path, tree: PyTree) -> None:
 
 
 def restore(folder: Path, template: T) -> T:
-    """Reads a tree of arrays; `template` gives structure, shapes and dtypes.
+    """Reads a tree of arrays; `template` gives structure, shapes and dtypes, or is these alone.
 
     Arrays are found by their names, so that a field which is None here may be unknown there.
 
@@ -131,7 +131,7 @@ def _without_key(leaf: jax.Array) -> jax.Array:
 
 def _restored(like: jax.Array, leaf: np.ndarray) -> jax.Array:
     if like.size == 0:
-        return like
+        return jnp.zeros(like.shape, like.dtype)
     if _is_key(like):
         return jax.random.wrap_key_data(jnp.array(leaf))
     return jnp.array(leaf.astype(like.dtype))
