@@ -1,4 +1,4 @@
-"""The controller of training: from a configuration to a finished run. No jax here.
+"""The controller of training: from a configuration to a finished run.
 
 Checks everything that can be checked before anything is started, then makes the run folder,
 enters the backend, runs the GMIs, and writes the summary however the job ends.

@@ -1,4 +1,4 @@
-"""Where a training job begins: in which run folder, and from which checkpoint. No jax here."""
+"""Where a training job begins: in which run folder, and from which checkpoint."""
 
 from __future__ import annotations
 

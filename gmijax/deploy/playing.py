@@ -1,4 +1,4 @@
-"""The controller of `gmijax.play`: from a checkpoint to returns and a film. No jax here.
+"""The controller of `gmijax.play`: from a checkpoint to returns and a film.
 
 Two children do the work, each a fresh interpreter: `gmijax.workers.playback` runs the episodes
 as the one GMI of a small plan, `gmijax.workers.play_film` films them.

@@ -1,4 +1,4 @@
-"""The configuration that a run was trained with, as its folder has it. No jax here."""
+"""The configuration that a run was trained with, as its folder has it."""
 
 from __future__ import annotations
 
