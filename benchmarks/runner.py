@@ -188,8 +188,7 @@ def failure_of(
       folder: what it works in, with the gmijax of this checkout; None: that of this process.
       variables: of the environment, beside those of this process.
     """
-    path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
-    of_folder = {} if folder is None else {"PYTHONPATH": path}
+    of_folder = {} if folder is None else own_path()
     done = subprocess.run(
         command,
         cwd=folder,
@@ -201,6 +200,12 @@ def failure_of(
     )
     lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
     return lines[-1] if done.returncode else None
+
+
+def own_path() -> dict[str, str]:
+    """The variable by which a process in any folder finds the gmijax of this checkout."""
+    path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
+    return {"PYTHONPATH": path}
 
 
 def as_word(text: str) -> str:

@@ -11,6 +11,7 @@ from benchmarks.cases import REWARD
 from benchmarks.evaluation.async_tables import KEYS, LONG, learners_over_one
 from benchmarks.evaluation.figures import NOT_MEASURED, bounds, ratio, results_of, shown
 from benchmarks.evaluation.learning_tables import seconds_over_one_process
+from benchmarks.evaluation.node_tables import two_nodes_over_one
 from benchmarks.evaluation.other_tables import USE, answers, model_fit
 from benchmarks.evaluation.paper import LGR, lgr_gain
 from benchmarks.evaluation.serving_tables import (
@@ -55,6 +56,7 @@ def claims() -> list[str]:
         from_512=_more_environments(512, 2048),
         from_2048=_more_environments(2048, 8192),
         learners=bounds(learners_over_one()),
+        nodes=two_nodes_over_one(),
         reward=", ".join(f"{task} {shown(seconds_over_one_process(task))}" for task in REWARD),
         **_reductions(),
         **_asynchronous(),

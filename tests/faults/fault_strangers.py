@@ -20,8 +20,9 @@ from fault_commands import COMMANDS, steps_saved
 from fault_fixtures import write_tasks
 from fault_processes import MARKER, processes_of, send
 from fault_report import Report
-from ray_cluster import RAY, two_nodes
 from training_jobs import child_environment, kill, pids_of, wait_until
+
+from benchmarks.two_ray_nodes import RAY, two_nodes
 
 _LIMIT_S = 150.0
 _ATTACK_S = 20.0

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ray_cluster import RAY, Cluster, two_nodes
 from training_jobs import (
     FOREVER,
     STEPS,
@@ -31,6 +30,7 @@ from training_jobs import (
     wait_until,
 )
 
+from benchmarks.two_ray_nodes import RAY, Cluster, two_nodes
 from gmijax.machine.nvidia import list_gpus
 from gmijax.partition.reduction import why_no_bindings, why_no_nccl
 

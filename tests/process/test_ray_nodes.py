@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ray_cluster import RAY, Cluster, two_nodes
 from training_jobs import (
     FOREVER,
     POINT,
@@ -32,6 +31,7 @@ from training_jobs import (
     wait_until,
 )
 
+from benchmarks.two_ray_nodes import RAY, Cluster, two_nodes
 from gmijax.machine.processes import identify
 from gmijax.runs.history import read_metrics
 

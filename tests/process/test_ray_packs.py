@@ -10,8 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from ray_cluster import RAY, two_nodes
 from training_jobs import kill, pids_of, require_gone, shared_memory, start, wait_until
+
+from benchmarks.two_ray_nodes import RAY, two_nodes
 
 pytestmark = [
     pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed"),

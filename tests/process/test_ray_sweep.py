@@ -10,7 +10,6 @@ import signal
 from pathlib import Path
 
 import pytest
-from ray_cluster import RAY, two_nodes
 from training_jobs import (
     POINT,
     STEPS,
@@ -23,6 +22,7 @@ from training_jobs import (
     wait_until,
 )
 
+from benchmarks.two_ray_nodes import RAY, two_nodes
 from gmijax.runs.history import read_metrics
 
 pytestmark = [
