@@ -88,9 +88,11 @@ def words_of(
     """
     is_one = case.way == ONE_NODE
     group = "plan" if case.verb == "train" else case.verb
-    both = f"{group}.gpus=[{','.join(map(str, gpus))}]"
-    where = (both,) if is_one and gpus else () if is_one else (RAY, address, "cluster.nodes=2")
-    words = ["-m", f"gmijax.{case.verb}", f"run.dir={folder}", *where]
+    words = ["-m", f"gmijax.{case.verb}", f"run.dir={folder}"]
+    if not is_one:
+        words += [RAY, address, "cluster.nodes=2"]
+    elif gpus:
+        words.append(f"{group}.gpus=[{','.join(map(str, gpus))}]")
     if case.verb == "train":
         places = ["plan.gpus=2"] if is_one and not gpus else []
         own = (f"plan.gmis_per_gpu={case.each}", *WAYS[case.way].overrides)
