@@ -68,7 +68,9 @@ def main() -> int:
         num_done = benchmark.run(cases, (given.runs or Path(scratch)).resolve())
     file = benchmark.file
     print(*markdown(HEAD, [*rows_of(file.results)]), f"written: {file.path}", sep="\n")
-    return int(num_done < len(cases) * given.repeats)
+    if left := (wanted := len(cases) * given.repeats) - num_done:
+        sys.stderr.write(f"{left} of {wanted} runs failed or had no time\n")
+    return int(left > 0)
 
 
 class Benchmark:
