@@ -206,6 +206,7 @@ class _TrainingJob:
             run=self._run,
             kind=training_kind(config),
             timeouts=config.run,
+            waits_after_ctrl_c=True,
             on_warning=self._console.print,
         )
 

@@ -230,9 +230,9 @@ class CommandKind:
         del job
         return self._settings.max_restarts
 
-    def stop_s(self, job: CommandJob) -> float:
+    def stop_s(self, job: CommandJob, *, is_urgent: bool) -> float:
         """See `Kind`."""
-        del job
+        del job, is_urgent  # Whether a command hangs is not known.
         return self._settings.stop_timeout_s
 
     def ended(self, job: CommandJob, run: RunPaths) -> None:

@@ -50,8 +50,8 @@ class Kind(Protocol[J]):
         """How often it may be started again after a fault."""
         ...
 
-    def stop_s(self, job: J) -> float:
-        """Seconds that it may take to save and end."""
+    def stop_s(self, job: J, *, is_urgent: bool) -> float:
+        """Seconds that it may take to save and end; after Ctrl-C it is not urgent."""
         ...
 
     def ended(self, job: J, run: RunPaths) -> None:

@@ -13,7 +13,7 @@ from gmijax.autotune.grid import Measured, NotRunnable
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.result import TrainResult
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.curve_window import CurveWindow
 from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.nodes import Host

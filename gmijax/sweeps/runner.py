@@ -17,7 +17,7 @@ from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RUNS, given_run, read_json, write_json
 from gmijax.runs.held import OpenFolder, locked
-from gmijax.supervise.run_gmis import StopSignals, stop_signals
+from gmijax.supervise.stop_signals import StopSignals, stop_signals
 from gmijax.sweeps.any_job import J
 from gmijax.sweeps.events import JobEvents
 from gmijax.sweeps.folder import errors_of_files, opened_folder
@@ -157,7 +157,7 @@ def _run_jobs(
 
         def tick() -> None:
             report.update()
-            view.update()
+            view.update(is_stopping=signals.have_come)
             job_events.update()
 
         Scheduler(

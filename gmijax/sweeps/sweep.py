@@ -17,7 +17,7 @@ from gmijax.control.console import Show, nearby
 from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.jobs import Job, jobs_of, require_placeable, state_of
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.kind import Kind

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from typing import Final
 
@@ -107,9 +108,11 @@ class TrainingKind:
         """See `Kind`."""
         return job.config.run.max_restarts
 
-    def stop_s(self, job: Job) -> float:
+    def stop_s(self, job: Job, *, is_urgent: bool) -> float:
         """See `Kind`."""
         run = job.config.run
+        if not is_urgent:
+            return math.inf  # Its controller sees whether a GMI hangs.
         return run.stop_timeout_s + run.grace_s + _KILL_AFTER_S
 
     def ended(self, job: Job, run: RunPaths) -> None:

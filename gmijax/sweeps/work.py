@@ -13,7 +13,7 @@ from rich.console import Console
 from gmijax.config import ClusterConfig
 from gmijax.config.sweep import JobsConfig, Ranking
 from gmijax.runs.folder import RunPaths
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.any_job import J
 from gmijax.sweeps.kind import Kind, Limiter
 from gmijax.sweeps.nodes import Host

@@ -24,7 +24,7 @@ from gmijax.errors import BackendUnavailable, ConfigError, NodeLost
 from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.held import OpenFolder
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps import kind, nodes, profile_jobs, scheduler
 from gmijax.sweeps.children import ChildStatus
 from gmijax.sweeps.host import ChildStart, LocalHost, Order
@@ -74,7 +74,7 @@ class FakeHost(LocalHost):
         return self.seen.get(child)
 
     def order(self, child: int, order: Order) -> None:
-        if order in ("ask_to_stop", "kill"):
+        if order in ("ask_to_stop", "interrupt", "kill"):
             self.seen[child] = ChildStatus(130)
         if order == "close":
             del self.running[child]

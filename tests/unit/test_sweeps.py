@@ -22,7 +22,7 @@ from gmijax.errors import ConfigError
 from gmijax.runs.folder import read_json, write_json
 from gmijax.runs.held import OpenFolder, is_locked, locked
 from gmijax.supervise.failures import may_be_anothers
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps import curve_window, jobs_per_gpu
 from gmijax.sweeps.curve_window import CurveWindow
 from gmijax.sweeps.host import LocalHost
