@@ -97,7 +97,12 @@ class Sweep:
         plan = plan_slots(self.settings, machine(0), {"auto"})
         self.slots = SlotPool([Site(plan, node.machine, node.name) for node in self.nodes])
 
-    def run(self, *steps: Any, kind: type[TrainingKind] = TrainingKind) -> None:
+    def run(
+        self,
+        *steps: Any,
+        kind: type[TrainingKind] = TrainingKind,
+        signals: StopSignals | None = None,
+    ) -> None:
         """Runs it; the steps are called one after another, the last one in every tick."""
         left = list(steps)
 
@@ -106,7 +111,7 @@ class Sweep:
 
         ranking = self.settings
         args = kind(ranking, self.paths), ranking, self.paths, self.slots, self.nodes, tick
-        Scheduler(self.jobs, Study(), *args).run(StopSignals())
+        Scheduler(self.jobs, Study(), *args).run(signals or StopSignals())
 
     def states(self) -> list[str]:
         return [job.progress.state for job in self.jobs]
