@@ -15,9 +15,11 @@ from gmijax.runs.folder import (
     RunPaths,
     create_run,
     given_run,
+    read_json,
     replays_of,
     require_new_run,
 )
+from gmijax.runs.names import nearby
 from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpoint
 from gmijax.runs.saved_config import (
     differences,
@@ -57,6 +59,8 @@ def find_start_point(config: TrainConfig) -> StartPoint:
     """
     if config.run.resume == "auto":
         return _go_on_or_start(config)
+    if config.run.resume is None and (run := _untrained(config)) is not None:
+        return StartPoint(run, notes=(f"nothing was trained in {nearby(run.root)} before",))
     require_new_run(config.run.dir, config.run.name, "; run.resume=auto continues that run")
     if config.run.resume is None:
         return StartPoint()
@@ -68,6 +72,17 @@ def find_start_point(config: TrainConfig) -> StartPoint:
             "set num_timesteps above that"
         )
     return StartPoint(checkpoint=checkpoint, notes=notes)
+
+
+def _untrained(config: TrainConfig) -> RunPaths | None:
+    """The run folder, if a command has ended there before it trained: its input may be mended."""
+    folder = given_run(config.run.dir, config.run.name)
+    if folder is None or not os.path.isfile(RunPaths(folder).summary):
+        return None
+    run = RunPaths(folder.resolve())
+    summary, nothing = read_json(run.summary), {"env_steps": None, "checkpoint": None}
+    is_training = "algo" in summary and summary.get("status") in ("failed", "interrupted")
+    return run if is_training and nothing.items() <= summary.items() else None
 
 
 def _go_on_or_start(config: TrainConfig) -> StartPoint:
