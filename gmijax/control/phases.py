@@ -13,7 +13,8 @@ from gmijax.supervise.watched_gmi import GmiStatus
 BEFORE_RUNNING: Final = ("starting", "waiting", "compiling")
 
 _STOPPING: Final = (
-    "stopping: finishing this iteration, then saving; a second Ctrl-C ends at once, without saving"
+    "stopping: finishing the iterations that have begun, then saving; a second Ctrl-C ends at "
+    "once, without saving"
 )
 
 _LONG_S: Final = 180.0

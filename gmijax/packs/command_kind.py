@@ -8,11 +8,11 @@ import shlex
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from gmijax.clock import running_s
 from gmijax.config.pack import PackConfig
@@ -157,6 +157,10 @@ class CommandKind:
             "GMIJAX_RUN_DIR": values["run_dir"],
             **given,
         }
+
+    def require_ranked(self, line: Mapping[str, Any]) -> None:
+        """See `Kind`."""
+        del line  # A command may print it for the first time at its end.
 
     def why_hung(self, running: Running[CommandJob]) -> str | None:
         """See `Kind`."""

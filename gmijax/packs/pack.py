@@ -150,10 +150,9 @@ class PackWork(Work[CommandJob]):
             "one for each core",
         )
 
-    def hint(self, report: Mapping[str, Any]) -> str:
+    @property
+    def unranked(self) -> str:
         """See `Work`."""
-        if report["ranking"] or all(job["state"] == "failed" for job in report["jobs"]):
-            return ""
         return "no reward was found in the output: pack.metric or pack.tag says where it is"
 
     def state_of(self, run: RunPaths, job: CommandJob) -> State:

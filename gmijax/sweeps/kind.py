@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 from gmijax.runs.folder import RunPaths
 from gmijax.sweeps.any_job import J
@@ -36,6 +36,14 @@ class Kind(Protocol[J]):
 
     def start(self, jobs: tuple[J, ...], slot: Slot) -> JobStart:
         """What runs them there."""
+        ...
+
+    def require_ranked(self, line: Mapping[str, Any]) -> None:
+        """A job has written this line of metrics.
+
+        Raises:
+          ConfigError: jobs have not what they are to be compared by.
+        """
         ...
 
     def why_hung(self, running: Running[J]) -> str | None:

@@ -42,7 +42,10 @@ def profile_jobs(
     gpus = settings.gpus if isinstance(settings.gpus, tuple) else None
     needed = job.num_gpus
     settings = dataclasses.replace(
-        settings, jobs_per_gpu=count, gpus=gpus[:needed] if gpus else needed
+        settings,
+        jobs_per_gpu=count,
+        gpus=gpus[:needed] if gpus else needed,
+        objective="return",  # Only their speed is compared.
     )
     limit_s = job.config.search.profile_limit_s
     with tempfile.TemporaryDirectory(prefix="gmijax-", dir=bench.scratch) as folder:

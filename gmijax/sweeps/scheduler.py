@@ -80,6 +80,7 @@ class Scheduler(Generic[J]):
 
         Raises:
           JobInterrupted: a signal came; all jobs have saved and ended.
+          ConfigError: jobs have not what they are to be compared by; all have saved and ended.
           NodeLost: no machine is left.
           GmijaxError, OSError: a job cannot be started, or the study not be written; all jobs have
             saved and ended.
@@ -166,6 +167,8 @@ class Scheduler(Generic[J]):
             is_over = running.is_over()
             for job, reader in zip(running.jobs, running.readers, strict=True):
                 for line in reader.new():
+                    if not running.is_asked:
+                        self._kind.require_ranked(line)
                     job.progress.report(line, self._ranking)
                     self._end_compile_wait(running)
             if running_s() > running.started_s + _FIRST_REPORT_S:

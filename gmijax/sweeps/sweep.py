@@ -100,6 +100,11 @@ class SweepWork(Work[Job]):
         del sites
         return TrainingKind(self.ranking, paths)
 
+    @property
+    def unranked(self) -> str:
+        """See `Work`."""
+        return f"no job that is complete has had sweep.objective={self.ranking.objective}"
+
     def state_of(self, run: RunPaths, job: Job) -> State:
         """See `Work`."""
         return state_of(run, job.config)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
-from typing import Final
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Final
 
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
@@ -17,6 +17,7 @@ from gmijax.sweeps.children import ChildStatus, Process
 from gmijax.sweeps.hparams import write_hparams
 from gmijax.sweeps.jobs import Job, placed
 from gmijax.sweeps.kind import JobStart
+from gmijax.sweeps.objective import require_logged
 from gmijax.sweeps.packs import PackPlanner, own_end
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.running import JobOutcome, Running
@@ -67,6 +68,10 @@ class TrainingKind:
         for reader in readers:
             reader.new()  # Those are an earlier attempt's.
         return JobStart(process, readers)
+
+    def require_ranked(self, line: Mapping[str, Any]) -> None:
+        """See `Kind`."""
+        require_logged(line, self._settings.objective)
 
     def why_hung(self, running: Running[Job]) -> str | None:
         """See `Kind`; a controller sees for itself whether its GMIs hang."""

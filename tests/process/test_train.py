@@ -151,7 +151,10 @@ def test_an_interrupt_saves_and_stops_everything(tmp_path: Path) -> None:
     wait_until(lambda: iteration_of(run, 1) >= 2, 120, "two iterations")
     job.send_signal(signal.SIGINT)
     assert job.wait(timeout=90) == 130
-    assert "finishing this iteration, then saving" in (tmp_path / "stdout.txt").read_text()
+    assert (
+        "finishing the iterations that have begun, then saving"
+        in (tmp_path / "stdout.txt").read_text()
+    )
     assert pids_of(run) == []
     assert _read(run / "summary.json")["status"] == "interrupted"
     checkpoint = find_checkpoint(str(run), "test")

@@ -19,7 +19,7 @@ from gmijax.cli.command import sweep_command
 from gmijax.cli.compose import compose
 from gmijax.clock import running_s
 from gmijax.config.sweep import SweepConfig
-from gmijax.errors import GmijaxError, JobInterrupted
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.runs.folder import read_json
 from gmijax.runs.held import OpenFolder, locked
 from gmijax.supervise.stop_signals import StopSignals
@@ -134,6 +134,23 @@ def test_jobs_are_asked_once_and_once_more_if_it_becomes_urgent(
         sweep.run(*steps, wait, end, signals=signals)
     assert orders == [*told, "close"]
     assert sweep.states() == ["interrupted"]
+
+
+def test_jobs_that_cannot_be_ranked_are_ended_at_their_first_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep = Sweep(tmp_path, jobs(6), objective="metric/distnace")
+    orders = orders_of(sweep, monkeypatch)
+
+    def report() -> None:
+        with sweep.paths.job(1).metrics.open("a") as file:
+            file.write(json.dumps({"env_steps": 9, "metric/distance": None}) + "\n")
+
+    with pytest.raises(ConfigError, match="did you mean metric/distance"):
+        sweep.run(report)
+    assert orders.count("ask_to_stop") == 4  # Those of all slots.
+    assert "kill" not in orders
+    assert sweep.states() == ["interrupted"] * 4 + ["waiting"] * 2
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -28,7 +28,7 @@ from gmijax.sweeps.curve_window import CurveWindow
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import Job, jobs_of, placed, require_placeable, state_of
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
-from gmijax.sweeps.objective import why_not_comparable, with_objective
+from gmijax.sweeps.objective import require_logged, why_not_comparable, with_objective
 from gmijax.sweeps.packs import most_together, require_packable
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.profile_jobs import profiled_job
@@ -158,6 +158,35 @@ def test_jobs_are_ranked_by_evaluations_if_they_make_some() -> None:
         job.progress.take({"env_steps": steps, **full, **more}, sweep)
     assert (job.progress.value, job.progress.latest) == (2.0, 1.0)
     assert job.progress.curve == [(100, 2.0), (200, 1.0)]
+
+
+LINE = dict.fromkeys(
+    ("env_steps", "return", "window/return", "reward/near", "metric/distance", "loss/kl")
+)
+EVALUATED = LINE | {"eval/return": 1.0, "eval/length": 20.0}
+
+
+@pytest.mark.parametrize(
+    ("line", "objective", "said"),
+    [
+        (LINE, "metric/distnace", r": did you mean metric/distance\?"),
+        (LINE, "metric/speed", r": allowed are metric/distance"),
+        (LINE, "loss/entropy_of_policy", r": allowed are loss/kl"),
+        (LINE, "retrun", r": did you mean return\?"),
+        (LINE, "speed/x", r": allowed are env_steps, loss/kl, metric/distance, return, reward/"),
+        (EVALUATED, "eval/lenght", r": did you mean eval/length\?"),
+    ],
+)
+def test_an_objective_that_no_line_has_is_refused(
+    line: dict[str, Any], objective: str, said: str
+) -> None:
+    with pytest.raises(ConfigError, match=rf"^sweep\.objective={objective}: not in the.*{said}"):
+        require_logged(line, objective)
+
+
+@pytest.mark.parametrize("objective", ["return", "metric/distance", "eval/length", "eval/x"])
+def test_an_objective_may_be_null_or_come_with_an_evaluation(objective: str) -> None:
+    require_logged(LINE, objective)
 
 
 @pytest.mark.parametrize(
