@@ -15,6 +15,7 @@ from gmijax.config.schema import from_dict, to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import Show, nearby
 from gmijax.control.decide import with_task
+from gmijax.control.large_on_cpu import large_on_cpu
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.stop_signals import StopSignals
@@ -119,9 +120,12 @@ class SweepWork(Work[Job]):
 
     def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """See `Work`."""
-        del sites
         is_left = any(job.progress.state != "completed" for job in self.jobs)
-        warnings = why_not_comparable(self.configs, self.ranking), _COMPILES if is_left else None
+        warnings = [why_not_comparable(self.configs, self.ranking)]
+        if is_left:
+            backend = sites[0].plan.backend
+            large = (line for config in self.configs for line in large_on_cpu(config, backend))
+            warnings += [next(large, None), _COMPILES]
         return tuple(filter(None, warnings))
 
 
