@@ -118,7 +118,11 @@ def _train(
             f"{plan.num_envs_per_gmi} environments per GMI, template {plan.template}, reduction "
             f"{plan.strategy}"
         )
-        lines = (*large_on_cpu(config, plan.backend), *replay_line(config, plan), *notes)
+        lines = (
+            *large_on_cpu(config, on_cpu=plan.backend == "cpu"),
+            *replay_line(config, plan),
+            *notes,
+        )
         announce(console, run, plan, what, (*decided.reasons, *lines))
         job = _TrainingJob(decided, run, folder, console, cluster, opengl)
         try:

@@ -13,10 +13,10 @@ _MANY_STEPS: Final = 10_000_000
 _SMALL: Final = "num_envs=64 num_timesteps=1e5"
 
 
-def large_on_cpu(config: TrainConfig, backend: str) -> tuple[str, ...]:
+def large_on_cpu(config: TrainConfig, *, on_cpu: bool) -> tuple[str, ...]:
     """A warning, and what to add for a small try; nothing where a GPU is used or not needed."""
     num_envs, steps = config.num_envs, config.num_timesteps
-    if backend != "cpu" or num_envs == "auto" or num_envs < _MANY_ENVS or steps < _MANY_STEPS:
+    if not on_cpu or num_envs == "auto" or num_envs < _MANY_ENVS or steps < _MANY_STEPS:
         return ()
     # Its updates cost by their batches, not by the number of environments.
     batch = " algo.batch_size=256" if isinstance(config.algo, SacConfig) else ""

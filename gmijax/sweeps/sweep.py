@@ -123,8 +123,8 @@ class SweepWork(Work[Job]):
         is_left = any(job.progress.state != "completed" for job in self.jobs)
         warnings = [why_not_comparable(self.configs, self.ranking)]
         if is_left:
-            backend = sites[0].plan.backend
-            large = (line for config in self.configs for line in large_on_cpu(config, backend))
+            on_cpu = {site.plan.backend for site in sites} == {"cpu"}
+            large = (line for one in self.configs for line in large_on_cpu(one, on_cpu=on_cpu))
             warnings += [next(large, None), _COMPILES]
         return tuple(filter(None, warnings))
 

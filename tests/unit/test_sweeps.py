@@ -218,6 +218,14 @@ def test_a_sweep_says_that_its_jobs_compile_first_unless_all_have_run() -> None:
     assert not work.warnings(())
 
 
+@pytest.mark.parametrize(("num_gpus", "says"), [(0, True), (1, False)])
+def test_a_sweep_of_what_is_meant_for_a_gpu_says_so_once(num_gpus: int, says: bool) -> None:
+    here = machine(num_gpus)
+    sites = [Site(plan_slots(SweepConfig(jobs_per_gpu=1), here, {"auto"}), here)]
+    lines = build_sweep(("env=ant", "seed=0,1")).warnings(sites)
+    assert sum("are meant for a GPU" in line for line in lines) == says
+
+
 def gpu_slots(gpus: int, jobs_per_gpu: int) -> SlotPool:
     here = machine(gpus, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
     plan = plan_slots(SweepConfig(jobs_per_gpu=jobs_per_gpu), here, {"auto"})
