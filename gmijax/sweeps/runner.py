@@ -102,11 +102,7 @@ def _run(
         if (wrong := report.end(status)) is not None:
             error.add_note(wrong)
         job_events.end(report.data)
-        folder = shlex.quote(nearby(paths.root))
-        if isinstance(error, JobInterrupted | SweepFailed):
-            error.add_note(f"continue: the same command with run.dir={folder}")
-        elif isinstance(error, ConfigError) and any(job.progress.attempts for job in jobs):
-            error.add_note(f"continue: the command with that mended and run.dir={folder}")
+        _say_how_to_continue(error, jobs, paths)
         raise
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
@@ -116,6 +112,14 @@ def _run(
     if ranking := report.data["ranking"]:
         print_next(console, work.next_step(paths, ranking[0]))
     return SweepResult(paths.root, report.data)
+
+
+def _say_how_to_continue(error: BaseException, jobs: Sequence[J], paths: SweepPaths) -> None:
+    folder = shlex.quote(nearby(paths.root))
+    if isinstance(error, JobInterrupted | SweepFailed):
+        error.add_note(f"continue: the same command with run.dir={folder}")
+    elif isinstance(error, ConfigError) and any(job.progress.attempts for job in jobs):
+        error.add_note(f"continue: the command with that mended and run.dir={folder}")
 
 
 def _require_success(
