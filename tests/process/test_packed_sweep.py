@@ -92,6 +92,7 @@ def test_after_a_kill_and_a_stop_all_jobs_of_a_program_go_on(tmp_path: Path) -> 
     sweep.send_signal(signal.SIGINT)
     assert sweep.wait(timeout=120) == 130
     assert states(tmp_path) == ["failed", "interrupted"] * 2
+    assert (tmp_path / "stdout.txt").read_text().count("stopping: running jobs save and end") == 1
 
     done = train(*command, cwd=tmp_path, command="sweep")
     assert done.returncode == 1
