@@ -131,6 +131,17 @@ def walking(calls: Calls) -> Rows:
             yield [f"`{task}`", name, start, seeds, *spreads, *_last_tests(call, trainer)]
 
 
+def seconds_until_it_walks(task: str) -> Figure | None:
+    """Seconds of training by SAC in the newest call, compiled before; None if one fails."""
+    calls = newest("walking-*-nvidia-*.json", _kind_of_walking)
+    for (of, algo, _, is_cold), (call, _) in calls.items():
+        if (of, algo, is_cold) == (task, "SAC", False):
+            ours = [run for run in call.results["runs"] if run["trainer"] != SCRIPT]
+            found = [run["walks_from"]["training_s"] for run in ours if run["walks_from"]]
+            return figure(found) if len(found) == len(ours) else None
+    return None
+
+
 def _last_tests(call: Call, trainer: str) -> Iterator[str]:
     """The last test of every training: medians over seeds."""
     runs = [run["checkpoints"] for run in call.results["runs"] if run["trainer"] == trainer]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from benchmarks.evaluation import claims, learning_tables, seed_tables  # noqa: F401
 from benchmarks.evaluation.async_tables import asynchronous_gains
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure, bounds, shown
-from benchmarks.evaluation.learning_tables import seconds_to_mark
+from benchmarks.evaluation.learning_tables import seconds_to_mark, seconds_until_it_walks
 from benchmarks.evaluation.other_tables import seconds_to_recover
 from benchmarks.evaluation.pack_tables import CLEANRL, MJLAB, eight_packed
 from benchmarks.evaluation.peer_tables import over_brax
@@ -49,6 +49,7 @@ def front() -> list[str]:
     return filled(
         "front",
         ant=_of(seconds_to_mark("ant"), ".1f"),
+        go1=_of(seconds_until_it_walks("go1"), ".0f"),
         eight=_of(first_gains("steady_steps_per_s").get(EIGHT), ".2f"),
         mjlab=eight_packed(MJLAB),
         cleanrl=eight_packed(CLEANRL),

@@ -156,19 +156,19 @@ class Agent:
         return unpack(snapshot.values.view(np.float32))
 
     def _send(self, unroll: _PendingRollout, env_state: BatchState) -> None:
-        arrays: dict[str, Any] = unroll.experience._asdict()
+        unrolls = unroll.experience
         if not self.sender.on_device:
-            arrays = {name: np.asarray(values) for name, values in arrays.items()}
+            unrolls = jax.tree.map(np.asarray, unrolls)
         stats = np.asarray(unroll.stats, np.float64)
         started = time.monotonic()
-        if not self._hand_over(arrays, unroll.version, env_state):
+        if not self._hand_over(unrolls, unroll.version, env_state):
             return
         sender, occupancy = self.sender, self.sender.occupancy()
         if not sender.least_occupancy():  # A trainer has nothing to do: it need not wait for more.
             sender.flush()
         self._unrolls += 1
         self._report = self._report._replace(
-            env_steps=self._report.env_steps + arrays["reward"].size,
+            env_steps=self._report.env_steps + unrolls.reward.size,
             bytes_sent=float(sender.num_bytes),
             send_s=self._report.send_s + time.monotonic() - started,
             wait_s=self._wait_s,
@@ -178,16 +178,11 @@ class Agent:
         self._publish()
         self.link.beat("running", self._unrolls)
 
-    def _hand_over(
-        self,
-        arrays: dict[str, npt.NDArray[Any]],
-        version: int,
-        env_state: BatchState,
-    ) -> bool:
+    def _hand_over(self, unrolls: Unrolls, version: int, env_state: BatchState) -> bool:
         """Sends an unroll; False if the job ends and nobody wants it any more."""
         limit_s, started = self.config.reduce.timeout_s, running_s()
         try:
-            while not self._offer(arrays, version, env_state):
+            while not self._offer(unrolls, version, env_state):
                 # Trainers that wait for a checkpoint make no room until it is complete.
                 if self._obey(env_state):
                     return False
@@ -200,24 +195,22 @@ class Agent:
             return False
         return True
 
-    def _offer(
-        self, arrays: dict[str, npt.NDArray[Any]], version: int, env_state: BatchState
-    ) -> bool:
+    def _offer(self, unrolls: Unrolls, version: int, env_state: BatchState) -> bool:
         """Whether the channels took an unroll within a moment; waits on an idle device count."""
-        if self._is_ahead(arrays, env_state):
+        if self._is_ahead(unrolls, env_state):
             return False
         costs, before_s = _is_idle(env_state), self.sender.waited_s
-        is_sent = self.sender.send(arrays, version, _SLICE_S)
+        is_sent = self.sender.send(unrolls, version, _SLICE_S)
         if costs:
             self._wait_s += self.sender.waited_s - before_s
         return is_sent
 
-    def _is_ahead(self, arrays: dict[str, npt.NDArray[Any]], env_state: BatchState) -> bool:
+    def _is_ahead(self, unrolls: Unrolls, env_state: BatchState) -> bool:
         """Waits a moment while `max_ahead` unrolls wait for every trainer; whether they still do.
 
         More of them in the channel would only make experience older.
         """
-        size = sum(array.nbytes for array in arrays.values())
+        size = sum(array.nbytes for array in unrolls)
         most = (self._algo.max_ahead - 0.5) * size / self.config.channel.capacity_bytes
         deadline_s = time.monotonic() + _SLICE_S
         while self.sender.least_occupancy() > most:

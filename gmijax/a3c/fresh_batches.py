@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from gmijax.a3c.report import MAX_COUNTED, BatchCounts, histogram_of
+from gmijax.a3c.targets import Unrolls
 from gmijax.channels.batcher import Batcher
 from gmijax.channels.experience import Rollouts
 from gmijax.clock import running_s
@@ -26,12 +26,12 @@ class FreshBatch(NamedTuple):
     """One batch of B unrolls.
 
     Attributes:
-      experience: by category.
+      unrolls: valid until the next batch is taken.
       weights: [B], of a fresh unroll equal to that of any other of the job; 0 of a stale one.
       counts: of all trainers.
     """
 
-    experience: Mapping[str, Any]
+    unrolls: Unrolls
     weights: npt.NDArray[np.float32]
     counts: BatchCounts
 
@@ -76,7 +76,7 @@ class FreshBatches:
             stop, of_all, stale, float(gathered[:, 3].max()), gathered[:, 4:].sum(axis=0)
         )
         scale = np.float32(self._comm.world_size * self._batch_size / of_all)
-        return FreshBatch(batch.experience, fresh * scale, counts)
+        return FreshBatch(Unrolls(**batch.experience), fresh * scale, counts)
 
     def _receive(self, version: int, updates: int) -> tuple[Rollouts, float]:
         """The next batch with something fresh in it, and the wait for it, seconds."""

@@ -1,4 +1,4 @@
-"""When a profile of an asynchronous job can be read, and what it says. No jax here."""
+"""When a profile of an asynchronous job can be read, and what it says."""
 
 from __future__ import annotations
 

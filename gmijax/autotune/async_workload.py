@@ -1,4 +1,4 @@
-"""Asynchronous training as a workload: how many GMIs act and train, on how many GPUs. No jax.
+"""Asynchronous training as a workload: how many GMIs act and train, on how many GPUs.
 
 A profile is a real job, on one GPU where every GPU of the job acts and trains, else on one that
 acts and one that trains.

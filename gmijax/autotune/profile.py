@@ -1,4 +1,4 @@
-"""One profile of a search: a real short job in child GMIs. No jax here.
+"""One profile of a search: a real short job in child GMIs.
 
 Whatever goes wrong in the job is an answer, not an error.
 """

@@ -1,4 +1,4 @@
-"""What a search shows and leaves: progress, table, sentence, report, plot. No jax here."""
+"""What a search shows and leaves: progress, table, sentence, report, plot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Algorithm 2 of the paper (section 5.2): which environments per GMI and GMIs per GPU. No jax.
+"""Algorithm 2 of the paper (section 5.2): which environments per GMI and GMIs per GPU.
 
 Pure rules over a `profile` function that measures one point; `gmijax.autotune.tuner` gives it
 one that runs training jobs, tests give it a formula. What the lines of the paper became:

@@ -1,4 +1,4 @@
-"""The profile store: what profiles of searches and sweeps found, for the next. No jax here.
+"""The profile store: what profiles of searches and sweeps found, for the next.
 
 One JSON file for a device, a task with its settings, and the versions of what computes. It is
 written after every profile: what was interrupted goes on from there, and a second search of the

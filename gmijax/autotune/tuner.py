@@ -1,4 +1,4 @@
-"""A search for `num_envs` and `plan.gmis_per_gpu`, by profiling. No jax here.
+"""A search for `num_envs` and `plan.gmis_per_gpu`, by profiling.
 
 The rules are in `gmijax.autotune.search`, a single profile in `gmijax.autotune.profile`. Here
 they meet the profile store, the time budget and the console.

@@ -1,4 +1,4 @@
-"""Jobs that a search can profile: what a profile runs, and what it says. No jax here."""
+"""Jobs that a search can profile: what a profile runs, and what it says."""
 
 from __future__ import annotations
 

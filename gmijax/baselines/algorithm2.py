@@ -1,4 +1,4 @@
-"""`search.order=as_printed`: Algorithm 2 of the paper (section 5.2) as it is printed. No jax.
+"""`search.order=as_printed`: Algorithm 2 of the paper (section 5.2) as it is printed.
 
 Physics implementations are a further loop around it. What `gmijax.autotune.search` does otherwise
 is said there, line by line.

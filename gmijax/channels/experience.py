@@ -89,7 +89,7 @@ class Rollouts(NamedTuple):
     """
 
     spec: Spec
-    experience: dict[str, Array]
+    experience: dict[str, Any]
     versions: npt.NDArray[np.int64]
     agents: npt.NDArray[np.int64]
 

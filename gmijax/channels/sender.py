@@ -99,11 +99,12 @@ class Sender:
         self._waiting: deque[Rollouts] = deque()
         self._is_open = True
 
-    def send(self, experience: Experience, version: int, timeout_s: float) -> bool:
+    def send(self, experience: Experience | Any, version: int, timeout_s: float) -> bool:
         """Sends one rollout; the caller may change its arrays once that is done.
 
         Args:
-          experience: arrays by channel; names, S, dtypes and what follows N stay the same.
+          experience: arrays by channel, as a mapping or a NamedTuple; names, S, dtypes and what
+            follows N stay the same.
           version: of the policy that acted.
           timeout_s: longest wait for room.
 

@@ -1,1 +1,1 @@
-"""A job on several machines, which Ray finds and watches. No jax here."""
+"""A job on several machines, which Ray finds and watches."""

@@ -10,10 +10,10 @@ from typing import Final, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gmijax.learning.algorithm import saved_state
 from gmijax.learning.checkpoint import digest
 from gmijax.learning.learner import Learner, acting_moments, make_learner
 from gmijax.learning.normalize import normalize
+from gmijax.learning.start import saved_state
 from gmijax.learning.unroll import Counts, Outcome, count, outcome_of
 from gmijax.learning.unroll import unroll as run_steps
 from gmijax.runs.saved_config import trained_config

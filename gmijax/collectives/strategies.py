@@ -65,7 +65,8 @@ def stages(
     On several nodes each of them does that inside. Then by `tcp` their first ranks sum, and give
     it to the others of their nodes. By `nccl` rings go over all nodes: with one GMI on each GPU
     one ring is all there is; the last ring of `mrr` and the ring between the GPUs of `har` have
-    members on all nodes; with `one_shot` and `mpr` the first ranks of the nodes form a ring.
+    members on all nodes; with `one_shot` the first ranks of the nodes form a ring.
+    With `mpr` nodes sum by TCP all the same.
 
     Args:
       strategy: a key of `COSTS`.
@@ -73,13 +74,13 @@ def stages(
       intra: `host` or `ipc`, the transport inside a GPU for `har`.
       inter: `nccl` or `tcp`, between nodes; None: by TCP if there are several.
     """
-    if layout.num_nodes > 1 and inter != "nccl":
+    if layout.num_nodes > 1 and (inter != "nccl" or strategy == "mpr"):
         return _over_nodes(stages(strategy, layout.of_node(0), intra), layout.gmis_of_node)
     gpus = layout.gmis_of_gpu
     if strategy == "mpr":
-        return _and_between("all_reduce", "host", layout.gmis_of_node)
+        return [ReductionStage("all_reduce", "host", layout.gmis_of_node)]
     if strategy == "one_shot":
-        return _and_between("all_gather", "ipc", layout.gmis_of_node)
+        return _one_shot(layout.gmis_of_node)
     if layout.num_gmis == layout.num_gpus and (strategy != "har" or layout.num_nodes > 1):
         return [ReductionStage("all_reduce", "ring", (tuple(itertools.chain(*gpus)),))]
     return _multi_ring(layout) if strategy == "mrr" else _hierarchical(layout, intra)
@@ -110,9 +111,9 @@ def _crosses_nodes(stage: ReductionStage, layout: Layout) -> bool:
     return stage.transport == "nodes" or any(len(nodes) > 1 for nodes in homes)
 
 
-def _and_between(kind: Kind, transport: TransportName, nodes: Groups) -> Sequence[ReductionStage]:
+def _one_shot(nodes: Groups) -> Sequence[ReductionStage]:
     """One stage in each node, and if there are several a ring of their first ranks, and back."""
-    inside = ReductionStage(kind, transport, nodes)
+    inside = ReductionStage("all_gather", "ipc", nodes)
     if len(nodes) == 1:
         return [inside]
     between = ReductionStage("all_reduce", "ring", (tuple(node[0] for node in nodes),))

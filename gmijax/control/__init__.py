@@ -1,1 +1,1 @@
-"""The controller: plans, starts and watches jobs, searches, tells what there is. No jax here."""
+"""The controller: plans, starts and watches jobs, searches, tells what there is."""

@@ -1,4 +1,4 @@
-"""Where a command prints, and what it prints before it begins to work. No jax here.
+"""Where a command prints, and what it prints before it begins to work.
 
 Nothing that goes wrong with the output may end a job.
 """

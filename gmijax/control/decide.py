@@ -1,4 +1,4 @@
-"""Decides everything that is `auto` in a job, before anything is made or started. No jax here."""
+"""Decides everything that is `auto` in a job, before anything is made or started."""
 
 from __future__ import annotations
 

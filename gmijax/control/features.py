@@ -1,4 +1,4 @@
-"""What works beside training: films, export, sweeps, curves; and what mends them. No jax here."""
+"""What works beside training: films, export, sweeps, curves; and what mends them."""
 
 from __future__ import annotations
 

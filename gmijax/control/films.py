@@ -2,7 +2,7 @@
 
 The leader leaves the trajectory of an episode in the run folder (`gmijax.learning.episode_films`).
 A process of the controller draws it, `gmijax.workers.film_writer`: no GMI waits for a film, and
-GPUs are left alone where OSMesa, which draws on the CPU, is installed. No jax here.
+GPUs are left alone where OSMesa, which draws on the CPU, is installed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The controller of training: from a configuration to a finished run. No jax here.
+"""The controller of training: from a configuration to a finished run.
 
 Checks everything that can be checked before anything is started, then makes the run folder,
 enters the backend, runs the GMIs, and writes the summary however the job ends.
@@ -49,9 +49,7 @@ from gmijax.runs.compile_times import CompileTime
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
 from gmijax.runs.held import OpenFolder, is_locked
 from gmijax.runs.history import MetricsReader, copy_history
-from gmijax.runs.resume import (
-    CheckpointMeta,
-)
+from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import training_kind
 from gmijax.supervise.run_gmis import Launch, recorded

@@ -1,4 +1,4 @@
-"""The controller of several runs that are one program of one GMI. No jax here.
+"""The controller of several runs that are one program of one GMI.
 
 Each of them has a run folder as if it had been trained alone, but for the GMI's logs, which are in
 a folder of their own. There is one attempt: where the GMI is lost, the sweep starts the runs

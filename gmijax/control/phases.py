@@ -1,4 +1,4 @@
-"""What a job does before it trains, why that takes its time, and for how long. No jax here."""
+"""What a job does before it trains, why that takes its time, and for how long."""
 
 from __future__ import annotations
 

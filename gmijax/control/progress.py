@@ -1,4 +1,4 @@
-"""The progress of a job: a live panel on a terminal, plain lines elsewhere. No jax here."""
+"""The progress of a job: a live panel on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plan of a job that goes on without the GPUs or nodes that it has lost. No jax here."""
+"""The plan of a job that goes on without the GPUs or nodes that it has lost."""
 
 from __future__ import annotations
 

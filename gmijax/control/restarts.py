@@ -1,4 +1,4 @@
-"""Runs a job again from its last good checkpoint when GMIs were lost. No jax here.
+"""Runs a job again from its last good checkpoint when GMIs were lost.
 
 An attempt ends with all its processes, shared memory and daemons; the next one starts anew in the
 same run folder, on the GPUs that are left. What cannot get better by trying again ends the job at

@@ -1,7 +1,4 @@
-"""What a training job does with its run folder before, between and after its attempts.
-
-No jax here.
-"""
+"""What a training job does with its run folder before, between and after its attempts."""
 
 from __future__ import annotations
 

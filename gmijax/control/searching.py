@@ -1,4 +1,4 @@
-"""The controller of `gmijax.search`: a search by itself, without the job. No jax here."""
+"""The controller of `gmijax.search`: a search by itself, without the job."""
 
 from __future__ import annotations
 

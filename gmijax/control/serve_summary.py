@@ -1,4 +1,4 @@
-"""The summary of a serving job: `summary.json`, and its lines for people. No jax."""
+"""The summary of a serving job: `summary.json`, and its lines for people."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The controller of `gmijax.serve`: from a policy to throughput, latency and experience.
 
-No jax here. Like `gmijax.control.job`, it checks everything that can be checked before anything is
+Like `gmijax.control.job`, it checks everything that can be checked before anything is
 started, runs the GMIs of a plan, and writes the summary however the job ends.
 """
 

@@ -1,10 +1,11 @@
-"""Where a training job begins: in which run folder, and from which checkpoint. No jax here."""
+"""Where a training job begins: in which run folder, and from which checkpoint."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gmijax.config import EnvConfig, TrainConfig
 from gmijax.config.schema import to_dict
@@ -25,6 +26,7 @@ from gmijax.runs.saved_config import (
     differences,
     require_known_keys,
     saved_config,
+    task_and_algorithm,
     trained_config,
 )
 
@@ -65,7 +67,7 @@ def find_start_point(config: TrainConfig) -> StartPoint:
     if config.run.resume is None:
         return StartPoint()
     checkpoint, notes = choose_checkpoint(config.run.resume, "run.resume")
-    meta = _require_fit(config, checkpoint, config.run.resume)
+    meta = _require_fit(config, checkpoint, saved_config(checkpoint), config.run.resume)
     if meta.env_steps >= config.num_timesteps:
         raise ConfigError(
             f"num_timesteps={config.num_timesteps}: already trained for {meta.env_steps} steps; "
@@ -99,20 +101,22 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
             raise ConfigError(f"{shown} is neither a run folder nor empty")
         return StartPoint(run)
     # The folder of a checkpoint that may not be there yet.
-    env, algo = trained_config(run.checkpoint(0))
-    saved, wanted = (env.label, algo.name), (config.env.label, config.algo.name)
-    if saved != wanted:
+    saved = saved_config(run.checkpoint(0))
+    env, algo = task_and_algorithm(saved)
+    was, wanted = (env.label, algo.name), (config.env.label, config.algo.name)
+    if was != wanted:
         raise ConfigError(
-            f"{shown} holds a run of {' with '.join(saved)}, not {' with '.join(wanted)}"
+            f"{shown} holds a run of {' with '.join(was)}, not {' with '.join(wanted)}"
         )
-    was = saved_config(run.checkpoint(0))
-    require_known_keys(was, shown)
+    require_known_keys(saved, shown)
     found = newest_checkpoint(folder)
-    changes = differences(was, to_dict(config))
+    # Keys that its version did not have are as they were without.
+    whole = saved | {"env": to_dict(env), "algo": to_dict(algo)}
+    changes = differences(whole, to_dict(config))
     notes = (*found.passed_over, *(f"changed since the run: {text}" for text in changes))
     if found.checkpoint is None:
         return StartPoint(run, notes=notes)
-    meta = _require_fit(config, found.checkpoint, "auto")
+    meta = _require_fit(config, found.checkpoint, saved, "auto")
     is_complete = meta.env_steps >= config.num_timesteps
     return StartPoint(run, found.checkpoint, is_complete, notes)
 
@@ -178,8 +182,10 @@ def _environments_go_on(config: TrainConfig, plan: Plan, checkpoint: Path) -> bo
     return was == (plan.layout.num_gmis, config.envs_per_gmi, config.physics.impl)
 
 
-def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> CheckpointMeta:
-    """The checkpoint's meta data, if the job can go on from it."""
+def _require_fit(
+    config: TrainConfig, checkpoint: Path, saved: Mapping[str, Any], wanted: str
+) -> CheckpointMeta:
+    """The checkpoint's meta data, if the job can go on from it; `saved` is its configuration."""
     meta = CheckpointMeta.read(checkpoint)
     for name, have, want in (
         ("task", meta.env, config.env.label),
@@ -188,7 +194,7 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
     ):
         if have != want:
             raise ConfigError(f"run.resume={wanted}: checkpoint of {name} {have}, not {want}")
-    trained, algo = trained_config(checkpoint)
+    trained, algo = task_and_algorithm(saved)
     for key in config.algo.fixed_keys:
         have, want = getattr(algo, key), getattr(config.algo, key)
         if have != want:
@@ -197,7 +203,7 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
         if have != _memory_of(config.env)[key]:
             want = getattr(config.env, key)
             raise ConfigError(f"env.{key}={want}: a resumed run keeps its {have}")
-    seed = saved_config(checkpoint).get("seed", config.seed)
+    seed = saved.get("seed", config.seed)
     if config.seed != seed:
         raise ConfigError(f"seed={config.seed}: a resumed run keeps its seed {seed}")
     return meta

@@ -1,4 +1,4 @@
-"""The time that a job still takes. No jax here."""
+"""The time that a job still takes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Starts and ends the process that follows a run for Weights & Biases. No jax here."""
+"""Starts and ends the process that follows a run for Weights & Biases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The controller of `gmijax.export`: from a checkpoint to files that need no gmijax. No jax here.
+"""The controller of `gmijax.export`: from a checkpoint to files that need no gmijax.
 
 A child does the work, `gmijax.workers.exporter`, as the one GMI of a small plan. It runs on the
 CPU: nothing is simulated, and GPUs may be training.

@@ -1,4 +1,4 @@
-"""Pictures of played episodes: a film and a page, each made by a child of its own. No jax here."""
+"""Pictures of played episodes: a film and a page, each made by a child of its own."""
 
 from __future__ import annotations
 

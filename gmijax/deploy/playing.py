@@ -1,4 +1,4 @@
-"""The controller of `gmijax.play`: from a checkpoint to returns and a film. No jax here.
+"""The controller of `gmijax.play`: from a checkpoint to returns and a film.
 
 Two children do the work, each a fresh interpreter: `gmijax.workers.playback` runs the episodes
 as the one GMI of a small plan, `gmijax.workers.play_film` films them.
@@ -42,6 +42,7 @@ from gmijax.player.joystick import robot_of
 from gmijax.player.walking import ONE_ACTION, lines_of
 from gmijax.runs.compile_times import CompileTime
 from gmijax.runs.folder import (
+    POLICY,
     PlayPaths,
     RunPaths,
     read_json,
@@ -163,7 +164,9 @@ def _next_steps(config: PlayConfig, label: str) -> tuple[tuple[str, str], ...]:
     folder = shlex.quote(nearby(Path(str(config.run.dir))))
     view = ("watch it in the browser", f"gmijax view run.dir={folder}")
     export = ("write the policy as files for a robot", f"gmijax export run.dir={folder}")
-    return (view, export) if label in TASKS else (export,)  # The viewer has our tasks alone.
+    # The viewer has our tasks alone, and needs what checkpoints of older versions do not have.
+    can_view = label in TASKS and (Path(str(config.checkpoint)) / POLICY).exists()
+    return (view, export) if can_view else (export,)
 
 
 def _require_page(config: PlayConfig) -> None:

@@ -1,4 +1,4 @@
-"""Which run, checkpoint and task a command that takes a trained policy means. No jax here."""
+"""Which run, checkpoint and task a command that takes a trained policy means."""
 
 from __future__ import annotations
 

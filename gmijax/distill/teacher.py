@@ -7,11 +7,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from gmijax.errors import ConfigError
-from gmijax.learning.algorithm import saved_state
 from gmijax.learning.checkpoint import learner_sizes
 from gmijax.learning.learner import ActingWeights, acting_weights, make_learner
 from gmijax.learning.normalize import normalize
 from gmijax.learning.policy import ActorCritic
+from gmijax.learning.start import saved_state
 from gmijax.runs.resume import find_checkpoint
 from gmijax.runs.saved_config import trained_config
 from gmijax.sim.interface import EnvSpec

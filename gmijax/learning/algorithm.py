@@ -9,17 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import jax
 
 from gmijax.collectives.interface import Collectives
 from gmijax.config import AlgoConfig
-from gmijax.learning.checkpoint import restore_learner
-from gmijax.learning.learner import Learner, LearnerState, init_learner
+from gmijax.learning.learner import Learner, LearnerState
 from gmijax.learning.unroll import Counts
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState
@@ -117,11 +114,6 @@ def load_algorithm(config: AlgoConfig) -> Algorithm:
     return getattr(import_module(module), name)
 
 
-def init_of(config: AlgoConfig) -> Callable[[Learner[Any], int, PRNGKey], Any]:
-    """`(learner, obs_size, key)` to a state as checkpoints of such a run hold it."""
-    return load_algorithm(config).init if config.implementation else init_learner
-
-
 def iterate_all(
     iterate: Iterate,
     env: BatchedEnv,
@@ -133,13 +125,3 @@ def iterate_all(
 ) -> tuple[Any, Any, IterationMetrics]:
     """An iteration of several runs; states, memories and metrics have a leading axis [K]."""
     return jax.vmap(lambda *own: iterate(env, learner, collectives, model, *own))(states, memories)
-
-
-def saved_state(checkpoint: Path, learner: Learner[Any], obs_size: int) -> Any:
-    """The learner's state in a checkpoint of a run with such a learner.
-
-    Raises:
-      ConfigError: it does not fit the learner.
-    """
-    init = partial(init_of(learner.config), learner, obs_size)
-    return restore_learner(checkpoint, jax.jit(init)(jax.random.key(0)))

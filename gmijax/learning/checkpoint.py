@@ -16,7 +16,7 @@ import shutil
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -90,7 +90,7 @@ def require_finite(params: PyTree, env_name: str, env_steps: int) -> None:
 
 def save_learner(paths: RunPaths, env_steps: int, learner_state: PyTree) -> None:
     """Writes the shared part of the checkpoint at `env_steps`, not yet under its name."""
-    saved_arrays.save(_partial(paths, env_steps) / LEARNER, _present(learner_state))
+    saved_arrays.save(_partial(paths, env_steps) / LEARNER, learner_state)
 
 
 def save_envs(paths: RunPaths, env_steps: int, gmi: int, env_state: PyTree) -> None:
@@ -188,9 +188,7 @@ def restore_learner(checkpoint: Path, template: T) -> T:
     Raises:
       ConfigError: the checkpoint does not fit the template.
     """
-    fields, folder = _present(template), checkpoint / LEARNER
-    restored = saved_arrays.restore(folder, fields)
-    return restored if fields is template else cast("Any", template)._replace(**restored)
+    return saved_arrays.restore(checkpoint / LEARNER, template)
 
 
 def learner_sizes(checkpoint: Path) -> tuple[int, int, int]:
@@ -225,9 +223,7 @@ def restore_replay(checkpoint: Path, gmi: int, template: T) -> T:
     Raises:
       ConfigError: it has other shapes.
     """
-    # Empty arrays of numpy take no memory until they are written.
-    empty = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), template)
-    return saved_arrays.on_host(saved_arrays.restore(checkpoint / replay_name(gmi), empty))
+    return saved_arrays.on_host(saved_arrays.restore(checkpoint / replay_name(gmi), template))
 
 
 def digest(tree: PyTree) -> np.ndarray:
@@ -244,10 +240,3 @@ def _partial(paths: RunPaths, env_steps: int) -> Path:
     paths.checkpoints.mkdir(exist_ok=True)
     partial.mkdir(exist_ok=True)
     return partial
-
-
-def _present(state: Any) -> Any:
-    """The fields of a named tuple that are not None: older checkpoints do not know the others."""
-    if not hasattr(state, "_asdict"):
-        return state
-    return {name: part for name, part in state._asdict().items() if part is not None}

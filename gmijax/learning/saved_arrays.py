@@ -34,27 +34,26 @@ def save(folder: Path, tree: PyTree) -> None:
 
 
 def restore(folder: Path, template: T) -> T:
-    """Reads a tree of arrays; `template` gives structure, shapes and dtypes.
+    """Reads a tree of arrays; `template` gives structure, shapes and dtypes, or is these alone.
+
+    Arrays are found by their names, so that a field which is None here may be unknown there.
 
     Raises:
       ConfigError: what is there does not fit the template.
     """
-    plain = jax.tree.map(np.asarray, _storable(template))
     try:
         with _plain_path(folder) as path, ocp.StandardCheckpointer() as checkpointer:
-            restored = checkpointer.restore(path, plain)
+            saved = _by_name(checkpointer.restore(path))
     except Exception as error:
         # Orbax raises a plain `Exception` for an array that it cannot read. Anything else, such
         # as a device without enough memory, does not say that the checkpoint is bad.
         if not isinstance(error, ValueError | KeyError | OSError) and type(error) is not Exception:
             raise
-        saved = saved_shapes(folder)
-        why = (_difference(saved, _shapes(plain)) if saved else None) or lines_of(error)[0]
+        why = lines_of(error)[0]
         raise ConfigError(f"checkpoint {folder} does not fit this job: {why}") from error
-    # Orbax gives arrays of other shapes than those that were asked for.
-    if why := _difference(_shapes(restored), _shapes(plain)):
+    if why := _difference(_shapes(saved), _shapes(jax.eval_shape(_storable, template))):
         raise ConfigError(f"checkpoint {folder} does not fit this job: {why}")
-    return jax.tree.map(_restored, template, restored)
+    return jax.tree.map_with_path(lambda path, like: _restored(like, saved[_name(path)]), template)
 
 
 def saved_shapes(folder: Path) -> dict[str, tuple[int, ...]]:
@@ -101,11 +100,16 @@ def _difference(
 
 
 def _shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
-    """Shapes of all arrays of a tree by their dotted names."""
-    return {
-        jax.tree_util.keystr(path, simple=True, separator="."): leaf.shape
-        for path, leaf in jax.tree.leaves_with_path(tree)
-    }
+    return {name: leaf.shape for name, leaf in _by_name(tree).items()}
+
+
+def _by_name(tree: PyTree) -> dict[str, Any]:
+    """All arrays of a tree by their dotted names."""
+    return {_name(path): leaf for path, leaf in jax.tree.leaves_with_path(tree)}
+
+
+def _name(path: tuple[Any, ...]) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
 def _is_key(leaf: jax.Array) -> bool:
@@ -125,8 +129,9 @@ def _without_key(leaf: jax.Array) -> jax.Array:
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
-def _restored(like: jax.Array, leaf: jax.Array) -> jax.Array:
+def _restored(like: jax.Array, leaf: np.ndarray) -> jax.Array:
     if like.size == 0:
-        return like
-    array = jnp.array(leaf)
-    return jax.random.wrap_key_data(array) if _is_key(like) else array
+        return jnp.zeros(like.shape, like.dtype)
+    if _is_key(like):
+        return jax.random.wrap_key_data(jnp.array(leaf))
+    return jnp.array(leaf.astype(like.dtype))

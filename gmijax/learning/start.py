@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from gmijax.compile_once import compile_once
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.devices import memory_limit_bytes
 from gmijax.errors import ConfigError
+from gmijax.learning.algorithm import load_algorithm
 from gmijax.learning.checkpoint import (
     has_envs,
     has_replay,
@@ -21,7 +23,7 @@ from gmijax.learning.checkpoint import (
     saved_episodes,
 )
 from gmijax.learning.episode_window import EpisodeWindow
-from gmijax.learning.learner import Learner, TrainState
+from gmijax.learning.learner import Learner, TrainState, init_learner
 from gmijax.machine.host_limits import detect_host
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.runs.saved_config import saved_config
@@ -75,6 +77,18 @@ def first_state(
     if wanted != before:
         state = state._replace(learning_rate=jnp.asarray(wanted, jnp.float32))
     return state, meta.env_steps
+
+
+def saved_state(checkpoint: Path, learner: Learner[Any], obs_size: int) -> Any:
+    """The learner's state in a checkpoint of a run with such a learner.
+
+    Raises:
+      ConfigError: it does not fit the learner.
+    """
+    config = learner.config
+    init = load_algorithm(config).init if config.implementation else init_learner
+    shapes = jax.eval_shape(partial(init, learner, obs_size), jax.random.key(0))
+    return restore_learner(checkpoint, shapes)
 
 
 @jax.jit

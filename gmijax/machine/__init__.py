@@ -1,1 +1,1 @@
-"""What is found on a host: GPUs, MPS, limits, processes. No jax here."""
+"""What is found on a host: GPUs, MPS, limits, processes."""

@@ -1,4 +1,4 @@
-"""Settings of jax in the environment with which our programs do not work. No jax here.
+"""Settings of jax in the environment with which our programs do not work.
 
 A user sets them for other programs, and every child would inherit them.
 """

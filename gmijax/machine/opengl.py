@@ -1,4 +1,4 @@
-"""Which headless OpenGL draws films here; each is tried in a fresh interpreter. No jax here.
+"""Which headless OpenGL draws films here; each is tried in a fresh interpreter.
 
 MuJoCo chooses it when it is imported, from MUJOCO_GL.
 """

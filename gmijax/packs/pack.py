@@ -1,4 +1,4 @@
-"""Packs: any commands, several at a time on every GPU. No jax here."""
+"""Packs: any commands, several at a time on every GPU."""
 
 from __future__ import annotations
 

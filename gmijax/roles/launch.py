@@ -1,4 +1,4 @@
-"""The controller of roles: from a plan and roles to what they return. No jax here."""
+"""The controller of roles: from a plan and roles to what they return."""
 
 from __future__ import annotations
 

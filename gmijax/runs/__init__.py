@@ -1,1 +1,1 @@
-"""What jobs leave on the disk, and where they find it again. No jax here."""
+"""What jobs leave on the disk, and where they find it again."""

@@ -1,4 +1,4 @@
-"""The cache folder: compiled programs, profiles and measurements. No jax here."""
+"""The cache folder: compiled programs, profiles and measurements."""
 
 from __future__ import annotations
 

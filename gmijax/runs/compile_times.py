@@ -1,4 +1,4 @@
-"""How long compiling took here before, for whoever waits for it again. No jax here."""
+"""How long compiling took here before, for whoever waits for it again."""
 
 from __future__ import annotations
 

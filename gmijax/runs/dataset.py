@@ -1,4 +1,4 @@
-"""What serving writes into `output.dir`: names, and what is there already. No jax here.
+"""What serving writes into `output.dir`: names, and what is there already.
 
 `<output.dir>/dataset.json dataset.lock`
 `<output.dir>/gmi_000/000000.{npz,json} 000001.{npz,json} ...`

@@ -1,4 +1,4 @@
-"""Every file name of a run folder, and how files in it are written. No jax here."""
+"""Every file name of a run folder, and how files in it are written."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Folders that a job writes into: held by a lock, and noticed if they are no longer there.
-
-No jax here.
-"""
+"""Folders that a job writes into: held by a lock, and noticed if they are no longer there."""
 
 from __future__ import annotations
 

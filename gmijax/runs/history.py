@@ -1,4 +1,4 @@
-"""Reading a run's metrics, and the picture of its return curve. No jax here."""
+"""Reading a run's metrics, and the picture of its return curve."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names that gmijax gives to what it numbers, so that it knows its own again. No jax here.
+"""Names that gmijax gives to what it numbers, so that it knows its own again.
 
 Whoever has a run may put copies, notes and other things beside what gmijax writes. Only a name of
 exactly the right form is counted, read, moved or deleted.

@@ -1,4 +1,4 @@
-"""Finding a checkpoint and checking that it is whole and fits, without loading it. No jax here."""
+"""Finding a checkpoint and checking that it is whole and fits, without loading it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The configuration that a run was trained with, as its folder has it. No jax here."""
+"""The configuration that a run was trained with, as its folder has it."""
 
 from __future__ import annotations
 
@@ -55,12 +55,17 @@ def saved_config(checkpoint: Path) -> dict[str, Any]:
 def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
     """Task and algorithm of the run that a checkpoint lies in.
 
-    Keys that this version of gmijax does not know any more are left out.
-
     Raises:
       ConfigError: the checkpoint does not lie in the folder of a training run.
     """
-    saved = saved_config(checkpoint)
+    return task_and_algorithm(saved_config(checkpoint))
+
+
+def task_and_algorithm(saved: Mapping[str, Any]) -> tuple[EnvConfig, AlgoConfig]:
+    """Task and algorithm of a saved configuration.
+
+    Keys that this version of gmijax does not know any more are left out.
+    """
     algo, _ = known(ALGORITHMS, saved["algo"], "algo.")
     env, _ = known([EnvConfig], saved["env"], "env.")
     return from_dict(EnvConfig, env, "env."), from_named(ALGORITHMS, algo, "algo.")
@@ -88,7 +93,7 @@ def differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> list[str
       config: that of the job.
     """
     # As both are after a round trip through JSON.
-    before, now = flatten(saved), flatten(json.loads(json.dumps(config)))
+    before, now = (flatten(json.loads(json.dumps(one))) for one in (saved, config))
     return [
         f"{key} is {now.get(key)!r}, was {before.get(key)!r}"
         for key in dict.fromkeys((*now, *before))

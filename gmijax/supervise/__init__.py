@@ -1,1 +1,1 @@
-"""Starts, watches and ends the processes of a job. No jax here."""
+"""Starts, watches and ends the processes of a job."""

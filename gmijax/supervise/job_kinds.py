@@ -1,7 +1,7 @@
 """Kinds of jobs: their plans, the main that their GMIs run, the memory that these share.
 
 Real jobs, their restarts and the profiles of a search all start GMIs by these; GMIs of
-asynchronous jobs ask here who the others are. No jax here.
+asynchronous jobs ask here who the others are.
 """
 
 from __future__ import annotations

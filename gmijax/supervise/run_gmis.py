@@ -1,4 +1,4 @@
-"""Starts the GMIs of a plan and watches them to their end, with all that they share. No jax here.
+"""Starts the GMIs of a plan and watches them to their end, with all that they share.
 
 What GMIs share is made here and gone when `run_gmis` returns: blocks of memory without a name,
 and the backend with its daemons. The processes themselves are `gmijax.supervise.supervisor`'s.

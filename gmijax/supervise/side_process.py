@@ -1,4 +1,4 @@
-"""Processes beside a job that can do without them: what goes wrong is a line. No jax here."""
+"""Processes beside a job that can do without them: what goes wrong is a line."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Sweeps: many training jobs, several at a time on every GPU. No jax here."""
+"""Sweeps: many training jobs, several at a time on every GPU."""

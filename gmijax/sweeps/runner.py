@@ -1,4 +1,4 @@
-"""The controller of a sweep or a pack: from jobs to a ranking. No jax here."""
+"""The controller of a sweep or a pack: from jobs to a ranking."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sweeps: many training runs of gmijax. No jax here."""
+"""Sweeps: many training runs of gmijax."""
 
 from __future__ import annotations
 

@@ -34,8 +34,8 @@ def _run(link: ChildLink) -> None:
     # jax starts here, in the environment that the plan prepared.
     import jax
 
-    from gmijax.learning.algorithm import saved_state
     from gmijax.learning.learner import make_learner
+    from gmijax.learning.start import saved_state
     from gmijax.sim.camera import check_camera, choose_camera
     from gmijax.sim.randomize import make_envs
 

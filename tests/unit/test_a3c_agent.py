@@ -69,7 +69,7 @@ class _Publisher(_NoRoom):
         self._registers, self._packed = registers, packed
 
     def send(self, experience, version, timeout_s) -> bool:
-        self.taken.append(({name: x.copy() for name, x in experience.items()}, version))
+        self.taken.append((jax.tree.map(np.copy, experience), version))
         if len(self.taken) == 1:
             self._registers.weights.publish(self._packed, tag=4)
         if len(self.taken) == 3:
@@ -101,10 +101,10 @@ def test_newer_weights_are_taken_up_within_an_unroll(tmp_path) -> None:
 
     @jax.jit
     def told(experience, theirs):
-        obs = normalize(theirs.moments, experience["state"])
+        obs = normalize(theirs.moments, experience.state)
         networks, params = learner.networks, theirs.params
         output = networks.output(params, obs)
-        return networks.distribution.log_prob(output, params.log_std, experience["action"])
+        return networks.distribution.log_prob(output, params.log_std, experience.action)
 
     first, second, third = (experience for experience, _ in sender.taken)
     for experience, steps, theirs in (
@@ -114,7 +114,7 @@ def test_newer_weights_are_taken_up_within_an_unroll(tmp_path) -> None:
         (third, slice(None), bolder),
     ):
         want = told(experience, theirs)[steps]
-        np.testing.assert_allclose(experience["log_prob"][steps], want, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(experience.log_prob[steps], want, rtol=1e-4, atol=1e-4)
 
 
 def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path) -> None:

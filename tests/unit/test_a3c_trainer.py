@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gmijax.a3c.fresh_batches import FreshBatches
+from gmijax.a3c.targets import Unrolls
 from gmijax.channels.experience import Rollouts, Spec
 from gmijax.cli.compose import compose
 from gmijax.collectives.communicator import SingleRankCommunicator
@@ -23,7 +24,12 @@ class _Arrivals:
 
     def __init__(self, *versions: list[int]) -> None:
         self._batches = [
-            Rollouts(Spec(()), {}, np.array(one, np.int64), np.ones(len(one), np.int64))
+            Rollouts(
+                Spec(()),
+                dict.fromkeys(Unrolls._fields, np.zeros((1, len(one)), np.float32)),
+                np.array(one, np.int64),
+                np.ones(len(one), np.int64),
+            )
             for one in versions
         ]
 

@@ -8,6 +8,7 @@ import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -97,8 +98,22 @@ def test_a_checkpoint_from_before_a_field_fits_where_the_field_is_not_used(tmp_p
     assert found.more is None
     jax.tree.map(np.testing.assert_array_equal, tuple(found)[:2], tuple(known))
     assert restore_learner(new, like._replace(more=jnp.zeros(2))).more.tolist() == [7.0, 7.0]
-    with pytest.raises(ConfigError, match="does not fit this job"):
+    with pytest.raises(ConfigError, match=r"does not fit this job: it has no more, this job has$"):
         restore_learner(old, like._replace(more=jnp.zeros(2)))
+
+
+def test_environments_from_before_a_part_of_their_state_fit_where_it_is_not_used(tmp_path: Path):
+    run = RunPaths(tmp_path)
+    known = Before(jnp.arange(3), jax.random.split(jax.random.key(1), 2))
+    save_envs(run, 1, 0, {"physics": known})
+    meta = CheckpointMeta("ant", "ppo", 1, 1, 8, ((8,), (8,)), "jax")
+    old = finish_checkpoint(run, meta)
+    like = Now(jnp.zeros(3, jnp.int32), jax.random.split(jax.random.key(0), 2))
+    found = restore_envs(old, 0, {"physics": like})["physics"]
+    assert found.more is None
+    chex.assert_trees_all_equal(on_host(tuple(found)[:2]), on_host(tuple(known)))
+    with pytest.raises(ConfigError, match=r"it has no physics.more, this job has$"):
+        restore_envs(old, 0, {"physics": like._replace(more=jnp.zeros(2))})
 
 
 def zeros(width: int) -> TrainState:

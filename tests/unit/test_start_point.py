@@ -263,6 +263,16 @@ def test_auto_takes_the_machine_from_the_command(run: RunPaths):
     assert config_of(run.root).plan.gpus == 1
 
 
+def test_a_key_that_the_version_of_the_run_did_not_have_is_no_change(run: RunPaths):
+    saved = read_json(run.config)
+    del saved["algo"]["activation"], saved["algo"]["policy_obs_key"]
+    write_json(run.config, saved)
+    save(run, 100)
+    assert find_start_point(config_of(run.root)).notes == ()
+    [note] = find_start_point(config_of(run.root, "algo.policy_obs_key=state")).notes
+    assert note == "changed since the run: algo.policy_obs_key is 'state', was 'auto'"
+
+
 @pytest.mark.parametrize("key", ["algo.future_key", "new_group", "env.future"])
 def test_auto_refuses_keys_that_it_does_not_know(run: RunPaths, key: str):
     config = config_of(run.root)
