@@ -20,8 +20,14 @@ from gmijax.runs.folder import (
     replays_of,
     require_new_run,
 )
+from gmijax.runs.history import read_metrics
 from gmijax.runs.names import nearby
-from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpoint
+from gmijax.runs.resume import (
+    CheckpointMeta,
+    checkpoints_of,
+    choose_checkpoint,
+    newest_checkpoint,
+)
 from gmijax.runs.saved_config import (
     differences,
     require_known_keys,
@@ -82,9 +88,11 @@ def _untrained(config: TrainConfig) -> RunPaths | None:
     if folder is None or not os.path.isfile(RunPaths(folder).summary):
         return None
     run = RunPaths(folder.resolve())
-    summary, nothing = read_json(run.summary), {"env_steps": None, "checkpoint": None}
-    is_training = "algo" in summary and summary.get("status") in ("failed", "interrupted")
-    return run if is_training and nothing.items() <= summary.items() else None
+    summary = read_json(run.summary)
+    has_ended = "algo" in summary and summary.get("status") in ("failed", "interrupted")
+    # Not as the summary says, which may be of an attempt before one that was killed.
+    has_trained = checkpoints_of(run.root) or read_metrics(run.metrics)
+    return run if has_ended and not has_trained else None
 
 
 def _go_on_or_start(config: TrainConfig) -> StartPoint:

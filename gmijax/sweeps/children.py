@@ -135,7 +135,7 @@ class Child:
         with suppress(ProcessLookupError):
             if not self._is_client:
                 self._process.send_signal(self._stop_signal)
-            else:
+            elif not self._is_asked:  # A second signal could end it before it has saved.
                 self._is_asked = True
                 os.killpg(self.pid, self._stop_signal)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, Protocol
 
@@ -89,7 +90,8 @@ class Running(Generic[J]):
         """Asks it to save and end within so many seconds; once, and once more if it is urgent."""
         if self.was_urgent or (self.is_asked and not is_urgent):
             return  # A second time would end it without saving.
-        self.kill_at_s, self.was_urgent = running_s() + limit_s, is_urgent
+        self.kill_at_s = min(self.kill_at_s or math.inf, running_s() + limit_s)
+        self.was_urgent = is_urgent
         self.host.order(self.child_id, "ask_to_stop" if is_urgent else "interrupt")
 
     def kill(self) -> None:

@@ -176,17 +176,27 @@ def test_a_folder_in_which_nothing_was_trained_may_be_used_again(run: RunPaths, 
     assert found.notes == (f"nothing was trained in {run.root} before",)
 
 
+@pytest.mark.parametrize("is_saved", [False, True])
+def test_one_in_which_a_later_command_has_trained_is_not(run: RunPaths, is_saved: bool):
+    """It was killed, so the summary is still that of the one before."""
+    write_json(run.summary, UNTRAINED)
+    if is_saved:
+        save(run, 64)
+    else:
+        run.metrics.write_text('{"env_steps": 64}\n')
+    with pytest.raises(ConfigError, match=r"already; run\.resume=auto continues"):
+        find_start_point(compose("env=ant", f"run.dir={run.root}"))
+
+
 @pytest.mark.parametrize(
     "other",
     [
-        {"env_steps": 64},
-        {"checkpoint": "checkpoints/000000000064"},
         {"status": "completed"},
         {"status": "running"},
         {"algo": None},  # Of another command.
     ],
 )
-def test_any_other_folder_may_not(run: RunPaths, other: dict[str, Any]):
+def test_nor_is_any_other_folder(run: RunPaths, other: dict[str, Any]):
     summary = {key: value for key, value in (UNTRAINED | other).items() if value or key != "algo"}
     write_json(run.summary, summary)
     with pytest.raises(ConfigError, match=r"already; run\.resume=auto continues"):

@@ -174,6 +174,20 @@ def test_only_urgent_signals_give_jobs_a_time_to_end(
     assert ("kill" in orders) == (number == signal.SIGTERM)
 
 
+def test_a_command_is_asked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It knows no urgency, and what a second signal does to it is not known."""
+    process = Process("job", ("sleep", "600"), tmp_path / "log", is_client=True)
+    child, sent = Child(process, {}), []
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "killpg", lambda _, number: sent.append(number))
+            child.interrupt()
+            child.ask_to_stop()
+        assert sent == [signal.SIGTERM]
+    finally:
+        child.close()
+
+
 def test_an_order_that_cannot_be_written_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
