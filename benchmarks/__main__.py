@@ -4,27 +4,39 @@ from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 
 from benchmarks.evaluation import check, plots
+from benchmarks.records import add_calls
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import write_text
 
 
 def main() -> int:
-    """Checks or writes; returns 1 if a figure has no file or differs from it, 2 on bad input."""
+    """Does what it is told; returns 1 if a figure is not that of its file, 2 on bad input."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("check", help="compare README.md and docs/ with benchmarks/results")
     commands.add_parser("evaluation", help="write the tables, pictures and marked figures")
-    if parser.parse_args().command == "evaluation":
-        try:
+    add = commands.add_parser("add", help="add the calls of another machine to benchmarks/results")
+    add.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    given = parser.parse_args()
+    try:
+        if given.command == "add":
+            add_calls(given.files)
+        elif given.command == "evaluation":
             write()
-        except ConfigError as error:
-            sys.stderr.write(f"{error}\n")
-            return 2
-        return 0
+        else:
+            return _checked()
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    return 0
+
+
+def _checked() -> int:
     found = check.check()
-    sys.stdout.writelines(f"{finding}\n" for finding in found)
+    sys.stdout.writelines(f"{finding}\n" for finding in (*found, check.count()))
     return int(bool(found))
 
 

@@ -28,21 +28,13 @@ def _case(name: str, overrides: str, gpus: int = 1) -> Case:
 
 
 TASKS = ("ant", "anymal", "ball_balance", "franka_cabinet", "humanoid", "shadow_hand")
-PLANS = ((1, 65536), (4, 16384), (2, 32768), (1, 32768))
+REWARD = ("ant", "anymal", "humanoid")
+"""Tasks of the paper's figure 10."""
+
+PLANS = ((1, 65536), (4, 16384), (2, 32768))
 """GMIs on one GPU and environments in each, where it is near saturation."""
 
 _NO_RATES, _NO_CHECKPOINTS = "run.measure_throughput=false", "run.checkpoint_every=0"
-
-# Where the settings of a task ask for much more than it takes to learn it, fewer steps. Those of
-# ball_balance are made for a CPU.
-_LEARNING = {
-    "ant": "num_timesteps=60e6",
-    "anymal": "num_timesteps=60e6",
-    "ball_balance": "num_envs=4096 num_timesteps=10e6",
-    "franka_cabinet": "num_timesteps=50e6",
-    "humanoid": "num_timesteps=80e6",
-    "shadow_hand": "num_timesteps=120e6",
-}
 
 
 def _throughput(task: str, impl: str, num_envs: int) -> Case:
@@ -77,27 +69,10 @@ def _templates(task: str) -> tuple[Case, ...]:
     )
 
 
-_ANT = f"env=ant physics.impl=jax {_NO_CHECKPOINTS}"
-_THIRTY = f"{_ANT} num_timesteps=30e6"
-
-
-def _shared(gpus: int, gmis: int, own: str) -> tuple[Case, ...]:
-    """GMIs with 2048 environments each, with and without MPS."""
-    where = f"{gpus} GPUs x " if gpus > 1 else ""
-    return tuple(
-        _case(
-            f"{where}{gmis} GMIs x 2048, {backend}",
-            f"{own} num_envs=2048 plan.gmis_per_gpu={gmis} plan.backend={backend}",
-            gpus,
-        )
-        for backend in ("mps", "share")
-    )
-
-
-def _async(name: str, gpus: int, num_envs: int, overrides: str = "") -> Case:
-    """Agents with `num_envs` environments each, and trainers."""
-    own = f"{_ANT} algo=a3c plan.backend=mps channel.capacity_mib=256 num_envs={num_envs}"
-    return _case(name, f"{own} num_timesteps=30e6 {overrides}", gpus)
+def _async(name: str, num_envs: int, overrides: str) -> Case:
+    """Agents with `num_envs` environments each, and trainers, on four GPUs."""
+    own = f"env=ant {_NO_CHECKPOINTS} {_A3C} num_envs={num_envs} num_timesteps=200e6"
+    return _case(name, f"{own} {overrides}", 4)
 
 
 def _on(serving: str, training: str, agents: int, trainers: int) -> str:
@@ -107,11 +82,11 @@ def _on(serving: str, training: str, agents: int, trainers: int) -> str:
     )
 
 
-def _channel_designs(task: str, num_envs: int) -> tuple[Case, ...]:
+def _channel_designs(task: str) -> tuple[Case, ...]:
     """The paper's table: one GPU acts, one trains; experience by channels, or tensor by tensor."""
     shared = (
-        f"env={task} algo=a3c num_envs={num_envs} {_NO_CHECKPOINTS} "
-        f"num_timesteps={40 * 16 * num_envs} channel.capacity_mib=256 {_on('1', '1', 1, 1)}"
+        f"env={task} algo=a3c num_envs=2048 num_timesteps=10e6 channel.capacity_mib=256 "
+        f"{_on('1', '1', 1, 1)} {_NO_CHECKPOINTS} {_NO_RATES}"
     )
     return tuple(
         _case(f"{task} {design}", f"{shared} channel.design={design}", 2)
@@ -119,10 +94,10 @@ def _channel_designs(task: str, num_envs: int) -> tuple[Case, ...]:
     )
 
 
-def _lgr(task: str, *strategies: str) -> tuple[Case, ...]:
+def _lgr(task: str) -> tuple[Case, ...]:
     """Cells of the paper's table of LGR: so many GPUs with so many trainers each.
 
-    Without `strategies`, gradients through host memory against what Algorithm 1 takes.
+    Gradients through host memory, by what Algorithm 1 takes, and in GPU memory as jobs do here.
     """
     return tuple(
         _case(
@@ -134,23 +109,37 @@ def _lgr(task: str, *strategies: str) -> tuple[Case, ...]:
             gpus,
         )
         for gpus, gmis in ((2, 2), (2, 3), (4, 4))
-        for strategy in strategies or ("mpr", select_strategy(Layout.even(gpus, gmis)).strategy)
+        for strategy in ("mpr", select_strategy(Layout.even(gpus, gmis)).strategy, "one_shot")
     )
 
 
-def _scaling(*ways: tuple[int, str]) -> tuple[Case, ...]:
-    """8192 environments on every GPU: weak scaling, by GMIs on each and their strategy."""
-    return tuple(
-        _case(
-            f"{gpus} GPUs x {gmis} GMIs x {8192 // gmis}",
-            f"env=ant num_envs={8192 // gmis} num_timesteps={40 * 16 * 8192 * gpus} "
-            f"plan.gpus={gpus} plan.gmis_per_gpu={gmis} "
-            f"reduce.strategy={strategy if gpus * gmis > 1 else 'auto'} "
-            f"{_NO_RATES} {_NO_CHECKPOINTS}",
-            gpus,
-        )
-        for gmis, strategy in ways
-        for gpus in (1, 2, 4, 8)
+def _scaling(gpus: int, gmis: int, backend: str = "auto") -> Case:
+    """Ant with 8192 environments on every GPU: in one process, or in several GMIs."""
+    num_envs = 8192 // gmis
+    return _case(
+        f"{gpus} GPUs x {gmis} GMIs x {num_envs}" + ", share" * (backend == "share"),
+        f"env=ant num_envs={num_envs} num_timesteps={60 * 16 * 8192 * gpus} plan.gpus={gpus} "
+        f"plan.gmis_per_gpu={gmis} plan.backend={backend} {_NO_RATES} {_NO_CHECKPOINTS}",
+        gpus,
+    )
+
+
+def _reward(task: str, gmis: int) -> Case:
+    """A training with 8192 environments on one GPU, another seed in every repeat."""
+    return _case(
+        f"{task} {gmis} x {8192 // gmis}",
+        f"env={task} num_envs={8192 // gmis} num_timesteps=50e6 plan.gmis_per_gpu={gmis} "
+        f"seed={{run}} {_NO_RATES} {_NO_CHECKPOINTS}",
+    )
+
+
+def _sac(gpus: int, batch_size: int) -> Case:
+    """SAC with 4096 environments on every GPU, and so many transitions of its replay an update."""
+    return _case(
+        f"{gpus} GPUs x 4096, batches of {gpus} x {batch_size}",
+        f"env=ant algo=sac num_envs=4096 num_timesteps={64 * 16 * 4096 * gpus} plan.gpus={gpus} "
+        f"algo.batch_size={batch_size} {_NO_RATES} {_NO_CHECKPOINTS}",
+        gpus,
     )
 
 
@@ -160,28 +149,16 @@ def _long(name: str, gpus: int, num_envs: int, overrides: str = "") -> Case:
     return _case(name, f"{own} {overrides}", gpus)
 
 
-_GO1 = (
-    "env=playground env.name=Go1JoystickFlatTerrain tuned=locomotion_ppo num_timesteps=100e6 "
-    f"eval.every=10e6 seed={{run}} {_NO_RATES}"
-)
-_CARTPOLE = (
-    "env=playground env.name=CartpoleBalance tuned=dm_control_ppo eval.every=6e6 seed={run} "
-    f"{_NO_RATES}"
-)
 _A3C = "algo=a3c plan.backend=mps channel.capacity_mib=256"
 _ON_ONE = "channel.transport=device plan.serving_gmis_per_gpu=2"
 _ONE_EACH, _SEVERAL = "one process each", "4 agents + 2 trainers"
+
+_DECOUPLED = f"3 + 1 GPUs, {_SEVERAL}"
 
 SUITES = MappingProxyType(
     {
         # Every task: one process against several GMIs, each with as many environments as it takes.
         "plans": tuple(_plan(task, *plan) for plan in PLANS for task in TASKS),
-        # Playground's own settings; Go1 for half of its steps, by both kinds of value function.
-        "playground": (
-            _case("Go1JoystickFlatTerrain", _GO1),
-            _case("Go1JoystickFlatTerrain, symmetric", f"{_GO1} algo.value_obs_key=state"),
-            _case("CartpoleBalance", _CARTPOLE),
-        ),
         # Long enough that whole runs can be compared.
         "async-long": (
             _long("1 GPU, synchronous", 1, 8192),
@@ -190,66 +167,38 @@ SUITES = MappingProxyType(
             _long(f"1 + 1 GPUs, {_ONE_EACH}", 2, 8192, f"{_A3C} {_on('1', '1', 1, 1)}"),
             _long(f"1 + 1 GPUs, {_SEVERAL}", 2, 2048, f"{_A3C} {_on('1', '1', 4, 2)}"),
         ),
-        # Acting and learning on one GPU, with the same 8192 environments as in one GMI.
-        "async-1gpu": (
-            _case("sync, 1 GMI x 8192", f"{_THIRTY} num_envs=8192"),
-            _async("1 agent x 8192 + 1 trainer", 1, 8192),
-            _async("2 agents x 4096 + 1 trainer", 1, 4096, "plan.serving_gmis_per_gpu=2"),
-            _async("4 agents x 2048 + 1 trainer", 1, 2048, "plan.serving_gmis_per_gpu=4"),
-        ),
-        # One process a GPU against several, and against GPUs that do both.
-        "async-2gpu": (
-            _async(f"1 + 1 GPUs, {_ONE_EACH}", 2, 8192, _on("1", "1", 1, 1)),
-            _async(f"1 + 1 GPUs, {_SEVERAL}", 2, 2048, _on("1", "1", 4, 2)),
-            _async("2 GPUs, each 3 agents + 1 trainer", 2, 2048, _on("[0,1]", "[0,1]", 3, 1)),
-        ),
+        # One process a GPU against several.
         "async-4gpu": (
-            _async(f"3 + 1 GPUs, {_ONE_EACH}", 4, 8192, _on("3", "1", 1, 1)),
-            _async(f"3 + 1 GPUs, {_SEVERAL}", 4, 2048, _on("3", "1", 4, 2)),
+            _async(f"3 + 1 GPUs, {_ONE_EACH}", 8192, _on("3", "1", 1, 1)),
+            _async(_DECOUPLED, 2048, _on("3", "1", 4, 2)),
             _async(
-                *(f"3 + 1 GPUs, {_SEVERAL}, har, batches of 4 agents", 4, 2048),
+                *(f"{_DECOUPLED}, har, batches of 4 agents", 2048),
                 f"{_on('3', '1', 4, 2)} algo.batch_size=8192 reduce.strategy=har",
             ),
-            _async(
-                *("4 GPUs, each 3 agents + 1 trainer", 4, 2048),
-                _on("[0,1,2,3]", "[0,1,2,3]", 3, 1),
-            ),
         ),
-        "async-channels": (
-            *_channel_designs("ant", 4096),
-            *_channel_designs("anymal", 2048),
-            *_channel_designs("humanoid", 2048),
-        ),
-        # The same 8192 environments on one GPU: together, and in four GMIs.
-        "ant-1gpu": (
-            _case("1 GMI x 8192", f"{_THIRTY} num_envs=8192"),
-            *_shared(1, 4, _THIRTY),
-        ),
+        "async-channels": (*_channel_designs("anymal"), *_channel_designs("franka_cabinet")),
+        # Several learners, each with its own replay, against one.
+        "sac-2gpu": (_sac(1, 32768), _sac(2, 16384), _sac(2, 32768)),
         # Trainers among their simulators, and in GMIs of their own.
         **{f"templates-{task}": _templates(task) for task in ("ant", "humanoid")},
-        "ant-2gpu": _shared(2, 2, f"{_THIRTY} plan.gpus=2 {_NO_RATES}"),
-        # Every task, both implementations of MJX, one GMI.
+        # Every task, both implementations of MJX, one GMI; of two tasks other sizes too.
         **{
             f"tasks-{impl}": tuple(
                 _throughput(task, impl, num_envs)
-                for num_envs in (2048, 8192, 32768)
-                for task in TASKS
+                for num_envs in (512, 2048, 8192, 32768)
+                for task in (TASKS if num_envs == 8192 else ("ant", "humanoid"))
             )
             for impl in ("jax", "warp")
         },
-        # Every task with its own settings, another seed in every repeat.
-        **{
-            f"learn-{task}": (_case(task, f"env={task} seed={{run}} {own} {_NO_RATES}"),)
-            for task, own in _LEARNING.items()
-        },
-        # Gradients through host memory against the paper's choice, and without the host.
+        # Figure 10.
+        "reward": tuple(_reward(task, gmis) for task in REWARD for gmis in (1, 4)),
         **{f"lgr-{task}": _lgr(task) for task in ("ant", "humanoid", "shadow_hand")},
-        **{
-            f"lgr-{task}-one_shot": _lgr(task, "mpr", "one_shot")
-            for task in ("ant", "humanoid", "shadow_hand")
-        },
-        "scaling": _scaling((1, "flat"), (2, "har")),
-        "scaling-one_shot": _scaling((1, "one_shot"), (2, "one_shot")),
+        "scaling": (
+            *(_scaling(1, gmis) for gmis in (1, 2, 4)),
+            _scaling(1, 4, "share"),
+            *(_scaling(gpus, gmis) for gpus in (2, 4) for gmis in (1, 2)),
+            _scaling(2, 2, "share"),
+        ),
     }
 )
 """Suite -> cases. Ratios are taken within a suite, whose cases run in turn."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -16,19 +17,27 @@ Made = TypeVar("Made")
 
 
 class FreeGpus:
-    """The GPUs that are free, by index; usable from any thread."""
+    """The GPUs that are free, by index; usable from any thread.
+
+    Who asked first gets first: who needs several is not passed by others that need one.
+    """
 
     def __init__(self, count: int) -> None:
         self._free = set(range(count))
+        self._waiting: deque[object] = deque()
         self._changed = threading.Condition()
 
     @contextmanager
     def taken(self, count: int = 1) -> Iterator[tuple[int, ...]]:
         """Takes `count` of them once so many are free."""
+        me = object()
         with self._changed:
-            self._changed.wait_for(lambda: len(self._free) >= count)
+            self._waiting.append(me)
+            self._changed.wait_for(lambda: self._waiting[0] is me and len(self._free) >= count)
+            self._waiting.popleft()
             mine = sorted(self._free)[:count]
             self._free.difference_update(mine)
+            self._changed.notify_all()
         try:
             yield tuple(mine)
         finally:

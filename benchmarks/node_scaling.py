@@ -13,10 +13,10 @@ import sys
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from benchmarks.evaluation.figures import rate, results_of
-from benchmarks.evaluation.writer import markdown
+from benchmarks.evaluation.figures import rate
+from benchmarks.evaluation.writer import Calls, markdown, newest
 from benchmarks.runner import exit_code
 from gmijax.collectives.strategies import predicted_s
 from gmijax.errors import ConfigError
@@ -33,7 +33,7 @@ MESSAGE_US = 50.0
 
 ENOUGH = 0.9
 MOST_NODES = 1024
-BANDWIDTHS, RATES = "reduction-nvidia-h200", "tasks-warp"
+RATES = "tasks-warp"
 PATHS = MappingProxyType({"flat": "NCCL", "mpr": "host"})
 """How a node sums: the strategy, and what the table calls it."""
 
@@ -87,15 +87,26 @@ class Measured(NamedTuple):
     b2: float
 
 
+def reductions() -> Calls:
+    """The newest call of `benchmarks.reduction` on GPUs."""
+    return newest("reduction-nvidia-*.json", lambda _: "newest")
+
+
+def reduction_results() -> Mapping[str, Any]:
+    """What it measured; nothing without a file."""
+    return next((call.results for call, _ in reductions().values()), {})
+
+
 def measured() -> Measured:
-    """From the files of results; bandwidths of four GPUs, which are nearest to eight.
+    """From the files of results; of one with calls on two and four GPUs, bandwidths of four.
 
     Raises:
       ConfigError: something is not among them.
     """
-    found = results_of(BANDWIDTHS).get("earlier", {}).get("bytes_per_s")
+    results = reduction_results()
+    found = results.get("earlier", results).get("bytes_per_s")
     if not found:
-        raise ConfigError(f"{BANDWIDTHS}.json has no bandwidths of four GPUs")
+        raise ConfigError("no file of results of benchmarks.reduction has bandwidths")
     iterations = {}
     for task, training in TRAININGS.items():
         steps_per_s = rate(RATES, f"{task} warp {NUM_ENVS}")
@@ -187,7 +198,7 @@ def model_fit(strategy: str) -> list[float]:
     measured_as, halved = ("mrr", 2.0) if strategy == "flat" else (strategy, 1.0)
     return [
         halved * row[key] / row["predicted_s"]
-        for row in results_of(BANDWIDTHS).get("rows", ())
+        for row in reduction_results().get("rows", ())
         if row["strategy"] == measured_as and row["layout"] in ("[[0],[1]]", "[[0],[1],[2],[3]]")
         for key in ("median_s", "chained_s")
     ]

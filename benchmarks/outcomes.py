@@ -14,6 +14,8 @@ import numpy as np
 from scipy import stats
 
 Lines: TypeAlias = Sequence[Mapping[str, Any]]
+Curve: TypeAlias = Sequence[tuple[int, float, float | None]]
+"""Environment steps, seconds and the return of the latest episodes, None before the first."""
 
 WINDOW = 10
 """Iterations over which the reward of a step is averaged: fewer show what noise does."""
@@ -23,6 +25,8 @@ OPENED = 0.95
 _WANTED = {"franka_cabinet": ("metric/opened", OPENED)}
 """Task -> what its last episodes must show, and how much of it, instead of `LAST_TO_PEAK`."""
 
+CURVE_POINTS = 60
+
 HEALTH = (
     "policy/learning_rate_min",
     "policy/learning_rate_max",
@@ -30,6 +34,7 @@ HEALTH = (
     "loss/saturated_fraction",
     "loss/value_clip_fraction",
     "value/explained_variance",
+    "loss/end_atoms",
 )
 """What shows a run go wrong (docs/learning.md)."""
 
@@ -47,6 +52,7 @@ class Outcome(NamedTuple):
       diverged_steps: in all.
       at_end: means over the last iterations of `HEALTH` and of the task's own metrics; of
         evaluations, which act without noise, the last return and the highest.
+      curve: see `return_curve`.
     """
 
     seed: str
@@ -57,12 +63,26 @@ class Outcome(NamedTuple):
     wall_s: float
     diverged_steps: float
     at_end: Mapping[str, float]
+    curve: Curve = ()
 
 
 def smoothed(values: Sequence[float]) -> np.ndarray:
     """Means over `WINDOW` neighbours [P - WINDOW + 1]; over all of them where there are fewer."""
     width = min(WINDOW, len(values))
     return np.convolve(values, np.full(width, 1.0 / width), "valid")
+
+
+def return_curve(lines: Lines) -> Curve:
+    """About `CURVE_POINTS` of the lines, the first and the last one among them."""
+    kept = [*lines[:: max(1, len(lines) // CURVE_POINTS)]]
+    kept += [] if not lines or kept[-1] is lines[-1] else lines[-1:]
+    return [(line["env_steps"], line["wall_s"], line.get("return")) for line in kept]
+
+
+def seconds_to(mark: float, curve: Curve) -> float | None:
+    """From the first line until the return is that high; None if it never is."""
+    reached = (at for _, at, found in curve if found is not None and found >= mark)
+    return next((at - curve[0][1] for at in reached), None)
 
 
 def rewards(lines: Lines) -> list[float]:
@@ -105,6 +125,7 @@ def outcome_of(
         sum(line.get("diverged_steps") or 0.0 for line in lines),
         {name: value for name in names if (value := _late_mean(lines, name)) is not None}
         | ({"eval/last": evaluations[-1], "eval/peak": max(evaluations)} if evaluations else {}),
+        return_curve(lines),
     )
 
 

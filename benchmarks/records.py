@@ -111,11 +111,7 @@ class ResultsFile:
         """Lets one thread at a time change `results`, then writes the file."""
         with self._lock:
             yield self.results
-            # Read again: another command may have added a call since.
-            found = read_calls(self.path) if self.path.exists() else []
-            calls = [call for call in found if call.date != self._call.date] + [self._call]
-            data = {"format": FORMAT, "suite": self.suite}
-            write_json(self.path, {**data, "calls": [call._asdict() for call in calls]})
+            _add(self.path, self.suite, [self._call])
 
     def add(self, key: str, row: Mapping[str, Any], **more: Any) -> None:
         """Adds a row to one of the lists in `results`, and what else is known by then."""
@@ -146,10 +142,33 @@ def read_calls(path: Path) -> list[Call]:
     return [_of_old_file(found)]
 
 
+def add_calls(files: Sequence[Path], results: Path = RESULTS) -> None:
+    """Adds the calls in files of another machine to the files of results of their names.
+
+    Raises:
+      ConfigError: there is no such file.
+    """
+    for file in files:
+        calls = read_calls(file)
+        _add(results / file.name, read_json(file).get("suite", file.stem), calls)
+
+
+def _add(path: Path, suite: str, added: Sequence[Call]) -> None:
+    """Writes calls behind those that a file has by now; one that it has already is changed."""
+    dates = {call.date for call in added}
+    found = read_calls(path) if path.exists() else []
+    calls = [*(call for call in found if call.date not in dates), *added]
+    data = {"format": FORMAT, "suite": suite}
+    write_json(path, {**data, "calls": [call._asdict() for call in calls]})
+
+
 def calls_by_date(pattern: str) -> list[tuple[Call, Path]]:
-    """The calls in all files of results that match, with their files, oldest first."""
+    """The calls in all files of results that match, with their files, oldest first.
+
+    Those without a date are older than all others.
+    """
     found = [(call, path) for path in sorted(RESULTS.glob(pattern)) for call in read_calls(path)]
-    return sorted(found, key=lambda one: str(one[0].date))
+    return sorted(found, key=lambda one: one[0].date or "")
 
 
 def file_name(suite: str, device: str) -> str:

@@ -1,9 +1,11 @@
 """Runs suites of training commands and keeps what they measured.
 
-`python -m benchmarks.run ant-1gpu --repeats 3` runs the cases in turn (A B C A B C ...), prints
+`python -m benchmarks.run scaling --repeats 3` runs the cases in turn (A B C A B C ...), prints
 the medians, and adds a call with every run in it to `benchmarks/results/<suite>.json`. With
-`--gpus 4` as many runs go on at a time as there are GPUs for, each alone on its own. `--resume`
-goes on with the last call, if code and machine are still the same.
+`--gpus 4` as many runs go on at a time as there are GPUs for, each alone on its own. With
+`--deadline-s` runs that would not end in time are not started. `--resume` goes on with the last
+call, if code and machine are still the same. With `--gpus` NVML says which part of their SMs was
+busy (Hopper and newer).
 """
 
 from __future__ import annotations
@@ -13,25 +15,34 @@ import itertools
 import statistics
 import sys
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks.busy_sms import BusySms
 from benchmarks.cases import SUITES, Case
 from benchmarks.evaluation.figures import RATES, Figure, figure, over, shown
 from benchmarks.evaluation.writer import markdown
 from benchmarks.free_gpus import on_free_gpus
+from benchmarks.outcomes import return_curve
 from benchmarks.records import ResultsFile
-from benchmarks.runner import as_word, exit_code, failure_of, in_turn, options
+from benchmarks.runner import (
+    STOP_S,
+    as_word,
+    deadline,
+    exit_code,
+    failure_of,
+    in_turn,
+    options,
+)
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
 
-CURVE_POINTS = 60
-
 
 def main() -> int:
-    """Runs what the command line asks for; returns 1 if a run failed, else 0."""
+    """Runs what the command line asks for; returns 1 if a run failed or had no time, else 0."""
     given = _options()
     files = [
         (cases, _file(suite, cases, given))
@@ -45,9 +56,10 @@ def main() -> int:
         raise ConfigError(f"--gpus {given.gpus}: every case of these suites needs more")
     for case in large:
         sys.stderr.write(f"{case.name}: left out, it needs {case.gpus} GPUs\n")
+    deadline_s = deadline(given.deadline_s)
     with tempfile.TemporaryDirectory() as scratch:
         turns = [
-            _Turn(file, case, repeat, given.runs or Path(scratch))
+            _Turn(file, case, repeat, given.runs or Path(scratch), deadline_s)
             for cases, file in files
             for repeat, case in in_turn(cases, given.repeats)
             if case not in large and not is_done(file.results, case, repeat)
@@ -55,7 +67,10 @@ def main() -> int:
         on_free_gpus(given.gpus or None, turns, lambda turn: turn.case.gpus, _Turn.run)
     for _, file in files:
         print(*table(file.results), f"written: {file.path}", sep="\n")
-    return int(any(failures(file.results) for _, file in files))
+    left = sum(not is_done(turn.file.results, turn.case, turn.repeat) for turn in turns)
+    if left:
+        sys.stderr.write(f"{left} of {len(turns)} runs failed or had no time: see --resume\n")
+    return int(bool(left))
 
 
 def _file(suite: str, cases: Sequence[Case], given: argparse.Namespace) -> ResultsFile:
@@ -82,18 +97,33 @@ class _Turn(NamedTuple):
     case: Case
     repeat: int
     runs: Path
+    deadline_s: float
 
     def run(self, gpus: Sequence[int]) -> None:
         """Runs it, and writes: an interruption loses the running ones only."""
+        if time.monotonic() + self._longest_s() >= self.deadline_s - STOP_S:
+            return
+        started_s = time.monotonic()
         name = f"{self.file.suite}-{as_word(self.case.name)}-{self.repeat}"
         folder = unused(self.runs / name)
         own = (f"plan.gpus=[{','.join(map(str, gpus))}]",) if gpus else ()
-        done = run_case(self.case, self.repeat, (*own, f"run.dir={folder}"), folder)
+        with BusySms(gpus) as busy:
+            done = run_case(self.case, self.repeat, (*own, f"run.dir={folder}"), folder)
+        if "summary" in done:
+            done["busy_sms"] = busy.between(*training_of(folder))
         with self.file.changing() as results:
             kept = results["cases"][self.case.name]
             kept["config"] = done.pop("config", kept.get("config"))
             # Runs that go on at the same time are noted as they end: each has its number.
-            kept["runs"].append({**done, "repeat": self.repeat})
+            command_s = round(time.monotonic() - started_s, 2)
+            kept["runs"].append({**done, "repeat": self.repeat, "command_s": command_s})
+
+    def _longest_s(self) -> float:
+        """That a run of this case took in this call, before the first that one of any case did."""
+        cases = self.file.results["cases"]
+        mine = cases[self.case.name]["runs"]
+        runs = mine or [run for case in cases.values() for run in case["runs"]]
+        return max((run["command_s"] for run in runs), default=0.0)
 
 
 def unused(folder: Path) -> Path:
@@ -115,13 +145,11 @@ def run_case(case: Case, repeat: int, overrides: Sequence[str], folder: Path) ->
 def outcome(folder: Path) -> dict[str, Any]:
     """Configuration, summary and thinned curve of a run, and medians of what it logged."""
     lines = read_metrics(RunPaths(folder).metrics)
-    kept = lines[:: max(1, len(lines) // CURVE_POINTS)]
-    kept += [] if kept[-1] is lines[-1] else lines[-1:]
     names = [key for key in lines[-1] if key.startswith(("time/", "loss/", "async/"))]
     return {
         "config": read_json(RunPaths(folder).config),
         "summary": read_json(RunPaths(folder).summary),
-        "curve": [[line["env_steps"], line["wall_s"], line["return"]] for line in kept],
+        "curve": return_curve(lines),
         "evaluations": [
             [line["env_steps"], line["eval/return"]]
             for line in lines
@@ -133,20 +161,17 @@ def outcome(folder: Path) -> dict[str, Any]:
     }
 
 
+def training_of(folder: Path) -> tuple[float, float]:
+    """When a run had made its first iteration, and its last: seconds of `time.time`."""
+    path = RunPaths(folder).metrics
+    lines, end_s = read_metrics(path), path.stat().st_mtime
+    return end_s - (lines[-1]["wall_s"] - lines[0]["wall_s"]), end_s
+
+
 def median(lines: Sequence[Mapping[str, Any]], key: str) -> float | None:
     """Over the lines that have a value; None of nothing."""
     found = [line[key] for line in lines if line.get(key) is not None]
     return statistics.median(found) if found else None
-
-
-def failures(results: Mapping[str, Any]) -> list[str]:
-    """Names of the cases of which a repeat failed, and did not succeed later."""
-    return [
-        name
-        for name, case in results["cases"].items()
-        if {run["repeat"] for run in case["runs"]}
-        - {run["repeat"] for run in case["runs"] if "summary" in run}
-    ]
 
 
 def table(results: Mapping[str, Any]) -> list[str]:
@@ -189,6 +214,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--only", default="", metavar="TEXT", help="cases with TEXT in the name")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--gpus", type=int, help="run cases at the same time on so many GPUs")
+    parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
     parser.add_argument("--runs", type=Path, help="keep the run folders here")
     parser.add_argument("--resume", action="store_true", help="add to the runs in the JSON file")
     return parser.parse_args()

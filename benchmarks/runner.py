@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any, NamedTuple, TypeVar
 
 from benchmarks.records import RESULTS
@@ -175,16 +176,24 @@ def sweep_report(
     return code, read_json(report)
 
 
-def failure_of(command: Sequence[str], folder: Path | None = None) -> str | None:
+def failure_of(
+    command: Sequence[str],
+    folder: Path | None = None,
+    variables: Mapping[str, str] = MappingProxyType({}),
+) -> str | None:
     """Runs a command; the last line that it wrote to stderr if it failed, else None.
 
-    `folder` is what it works in, with the gmijax of this checkout; None: that of this process.
+    Args:
+      command: with its arguments.
+      folder: what it works in, with the gmijax of this checkout; None: that of this process.
+      variables: of the environment, beside those of this process.
     """
     path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
+    of_folder = {} if folder is None else {"PYTHONPATH": path}
     done = subprocess.run(
         command,
         cwd=folder,
-        env=None if folder is None else {**os.environ, "PYTHONPATH": path},
+        env={**os.environ, **of_folder, **variables},
         check=False,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,

@@ -8,7 +8,7 @@ Every row is a setting, trained with the same seeds as one sweep; the first row 
 What counts as success is in `benchmarks/outcomes.py`. After every row
 `benchmarks/results/seeds-<task>-<device>.json` is written: successes with Wilson's interval,
 quartiles over seeds, and p against the baseline. At the deadline the sweep that runs is stopped;
-its runs that are through are kept.
+its runs that are through are kept, and apart from them how far the others came.
 """
 
 from __future__ import annotations
@@ -64,13 +64,13 @@ def train(
         *(*given.overrides, *row.overrides, f"seed=range({given.seeds})"),
         *(f"sweep.jobs_per_gpu={given.at_once}", f"sweep.pack={given.pack}"),
     ]
-    started_s, code, outcomes = time.monotonic(), 130, []
+    started_s, code, outcomes = time.monotonic(), 130, list[Outcome]()
     try:
         code, _ = sweep_report(words, folder, deadline_s)
     finally:
         if (folder / "sweep.json").exists():
             report = read_json(folder / "sweep.json")
-            outcomes, unfinished = outcomes_of(task, folder, report)
+            outcomes, cut = outcomes_of(task, folder, report)
             found = {
                 "row": row.name,
                 "overrides": row.overrides,
@@ -78,36 +78,42 @@ def train(
                 "command_s": round(time.monotonic() - started_s, 2),
                 "status": report["status"],
                 "trainings_per_hour": report["trainings_per_hour"],
-                "unfinished": unfinished,
+                "unfinished": len(report["jobs"]) - len(outcomes),
                 **summary(outcomes),
                 **({} if baseline is None else against(outcomes, baseline)),
                 "each": [one._asdict() for one in outcomes],
+                "cut": [one._asdict() for one in cut],
             }
             file.add("rows", found)
             print(line(found), flush=True)
     return outcomes
 
 
-def outcomes_of(task: str, folder: Path, report: Mapping[str, Any]) -> tuple[list[Outcome], int]:
-    """Outcomes of the jobs of a sweep, and how many were not given the time to end.
+def outcomes_of(
+    task: str, folder: Path, report: Mapping[str, Any]
+) -> tuple[list[Outcome], list[Outcome]]:
+    """Outcomes of the jobs of a sweep, and of those that began and were not given the time to end.
 
     Args:
       task: of all jobs.
       folder: of the sweep; it may lie elsewhere than where it ran.
       report: its `sweep.json`.
     """
-    ended = [job for job in report["jobs"] if job["state"] in ("completed", "failed")]
-    outcomes = [
-        outcome_of(
-            task,
-            read_metrics(RunPaths(folder / Path(job["run_dir"]).name).metrics),
-            seed=str(job["overrides"].get("seed")),
-            completed=job["state"] == "completed",
-            wall_s=job["wall_s"],
-        )
-        for job in ended
-    ]
-    return outcomes, len(report["jobs"]) - len(ended)
+    ended, cut = list[Outcome](), list[Outcome]()
+    for job in report["jobs"]:
+        lines = read_metrics(RunPaths(folder / Path(job["run_dir"]).name).metrics)
+        has_ended = job["state"] in ("completed", "failed")
+        if has_ended or lines:
+            (ended if has_ended else cut).append(
+                outcome_of(
+                    task,
+                    lines,
+                    seed=str(job["overrides"].get("seed")),
+                    completed=job["state"] == "completed",
+                    wall_s=job["wall_s"],
+                )
+            )
+    return ended, cut
 
 
 def line(row: Mapping[str, Any]) -> str:

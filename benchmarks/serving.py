@@ -1,8 +1,9 @@
 """Measures serving: `python -m benchmarks.serving`, simulator and agent together and apart.
 
 The same environments act with random actions in m GMIs (template `tcg`), and in m GMIs that
-simulate plus one that infers (`tdg`). With `--backends mps share` both run under both. Adds a call
-to `benchmarks/results/serving-<device>.json`; `simulator_s`, `agent_s` and `com_s` in it are
+simulate plus one that infers (`tdg`). With `--backends mps share` both run under both. With
+`--gpus` cases run at the same time, each on a GPU of its own with its part of the cores. Adds a
+call to `benchmarks/results/serving-<device>.json`; `simulator_s`, `agent_s` and `com_s` in it are
 medians of the stages of one dedicated step of all environments of a GMI.
 """
 
@@ -17,10 +18,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.evaluation.other_tables import SERVING_HEAD, serving_row
+from benchmarks.evaluation.serving_tables import SERVING_HEAD, serving_row
 from benchmarks.evaluation.writer import markdown
+from benchmarks.free_gpus import Part, on_parts
 from benchmarks.records import results_file
 from benchmarks.runner import as_word, exit_code, failure_of, in_turn, options
+from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RunPaths, read_json
 
 Summary = Mapping[str, Any]
@@ -61,17 +64,31 @@ class Setting(NamedTuple):
 
 def main() -> int:
     """Measures what the command line asks for; returns 1 if a job failed, else 0."""
-    given = _options()
-    file = results_file(given, "serving")
-    for task, backend, m in itertools.product(given.tasks, given.backends, given.simulators):
-        # The environments of a task are split over its simulators.
-        case = measure(Setting(task, backend, m, given.envs // m), given)
+    given, machine = _options(), detect_machine()
+    # A case has one GPU, however many work at the same time.
+    of_one = f"1 x {machine.gpus[0].name}" if machine.gpus else None
+    file = results_file(given, "serving", device=of_one)
+
+    def run(setting: Setting, part: Part) -> None:
+        case = measure(setting, given, part)
         file.add("cases", case)
         print(*markdown(SERVING_HEAD, [serving_row(case)]), sep="\n", flush=True)
+
+    on_parts(machine, given.gpus, settings_of(given), run)
     return int(any("failed" in case for case in file.results["cases"]))
 
 
-def measure(setting: Setting, given: argparse.Namespace) -> dict[str, Any]:
+def settings_of(given: argparse.Namespace) -> list[Setting]:
+    """The environments of a task are split over its simulators; one alone shares with nobody."""
+    first, *_ = given.backends
+    return [
+        Setting(task, backend, m, given.envs // m)
+        for task, backend, m in itertools.product(given.tasks, given.backends, given.simulators)
+        if m > 1 or backend == first or "tdg" in given.templates
+    ]
+
+
+def measure(setting: Setting, given: argparse.Namespace, part: Part) -> dict[str, Any]:
     """Both templates in turn, as often as wanted; a case of the file.
 
     Throughputs and times are medians over the repeats; every repeat's summary is kept.
@@ -80,7 +97,8 @@ def measure(setting: Setting, given: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as scratch:
         for repeat, template in in_turn(given.templates, given.repeats):
             name = f"{as_word(setting.name)}-{template}-{repeat}"
-            if failure := failure_of(setting.command(given, template, name), Path(scratch)):
+            command = [*part.prefix, *setting.command(given, template, name)]
+            if failure := failure_of(command, Path(scratch), part.variables):
                 sys.stderr.write(f"{setting.name}, {template}: {failure}\n")
                 return {"name": setting.name, "failed": failure}
             runs[template].append(read_json(RunPaths(Path(scratch) / "runs" / name).summary))
@@ -110,6 +128,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--impl", default="auto", choices=["auto", "jax", "warp"])
     parser.add_argument("--unroll-length", type=int, default=32)
     parser.add_argument("--unrolls", type=int, default=20, help="unrolls of every GMI")
+    parser.add_argument("--gpus", type=int, default=1, help="for cases at the same time")
     parser.add_argument("--repeats", type=int, default=1)
     return parser.parse_args()
 

@@ -6,7 +6,18 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.cases import SUITES, Case
-from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, figure, rate, ratio, shown
+from benchmarks.evaluation.figures import (
+    TRAINING,
+    WHOLE_RUN,
+    Figure,
+    figure,
+    over,
+    rate,
+    ratio,
+    results_of,
+    shown,
+    summaries,
+)
 from benchmarks.evaluation.paper import CHANNELS
 from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
 from benchmarks.records import Call
@@ -15,33 +26,59 @@ LONG = "async-long"
 KEYS = ("pps", "ttop", WHOLE_RUN)
 RATES, GAINS = ("rounds", "updates"), ("held", "rounds_free", "updates_free")
 
-ASYNC = ("async-1gpu", "async-2gpu", "async-4gpu")
-"""Suites; what each begins with is what its others are compared with."""
+FOUR, LEARNERS = "async-4gpu", "sac-2gpu"
 
 
 @table(
     "async",
     "ant | PPS: | TTOP: | steps/s of the whole run: | ratios: | the paper's: | return at the end:",
-    *ASYNC,
+    FOUR,
 )
 def asynchronous() -> Rows:
-    """Agents and trainers: medians of report lines, and whole runs."""
-    cases = [(suite, one.name) for suite in ASYNC for one in SUITES[suite]]
-    for file, case in cases:
-        if "each 3 agents" in case:  # GPUs that do both.
-            continue
-        base = SUITES[file][0].name
-        cells = [shown(rate(file, case, key), ",.0f") for key in KEYS]
-        gains = [shown(ratio(file, case, base, key)) for key in KEYS]
-        name, paper = case, "1.88 PPS, 1.65 TTOP"  # Its mean over two and four GPUs.
+    """Agents and trainers on four GPUs: medians of report lines, and whole runs."""
+    base = SUITES[FOUR][0].name
+    for case in (one.name for one in SUITES[FOUR]):
+        cells = [shown(rate(FOUR, case, key), ",.0f") for key in KEYS]
+        gains = [shown(ratio(FOUR, case, base, key)) for key in KEYS]
+        paper = "1.88 PPS, 1.65 TTOP"  # Its mean over two and four GPUs.
         if case == base:
             gains, paper = ["1"] * 3, "1"
-        if file == "async-1gpu":  # One process that does both has no PPS of its own.
-            name, paper = f"1 GPU, {case}", ""
-            gains = [shown(ratio(file, case, base)), gains[2]]
-            cells[:2] = "" if case == base else cells[0], shown(rate(file, case), ",.0f")
-        final = shown(rate(file, case, "final_return"), ",.0f")
-        yield [name, *cells, " / ".join(gains), paper, final]
+        final = shown(rate(FOUR, case, "final_return"), ",.0f")
+        yield [case, *cells, " / ".join(gains), paper, final]
+
+
+@table(
+    LEARNERS,
+    "ant, SAC | PPS: | over one GPU: | TTOP, transitions drawn a second: | over one GPU: "
+    "| the paper's A3C, PPS / TTOP:",
+    LEARNERS,
+)
+def several_learners() -> Rows:
+    """Learners that act, each with its own replay, and average their gradients."""
+    base = SUITES[LEARNERS][0].name
+    for case in (one.name for one in SUITES[LEARNERS]):
+        acting, drawn = rate(LEARNERS, case), _drawn(case)
+        paper = "1 / 1" if case == base else "1.88 / 1.65"
+        yield [
+            *(case, shown(acting, ",.0f"), shown(over(acting, rate(LEARNERS, base)))),
+            *(shown(drawn, ",.0f"), shown(over(drawn, _drawn(base))), paper),
+        ]
+
+
+def learners_over_one() -> list[float | None]:
+    """Steps/s of learners on two GPUs over one, of every case."""
+    base, *others = (one.name for one in SUITES[LEARNERS])
+    return [ratio(LEARNERS, case, base) for case in others]
+
+
+def _drawn(case: str) -> Figure | None:
+    """Transitions that all learners of a case draw from their replays in a second."""
+    config = results_of(LEARNERS).get("cases", {}).get(case, {}).get("config")
+    if config is None:
+        return None
+    algo = config["algo"]
+    for_each_step = algo["updates_per_step"] * algo["batch_size"] / config["num_envs"]
+    return figure([for_each_step * one[TRAINING] for one in summaries(LEARNERS, case)])
 
 
 @table(
@@ -78,7 +115,7 @@ def asynchronous_gains(gpus: int) -> list[float | None]:
 )
 def channels() -> Rows:
     """Channels against tensor by tensor, in jobs."""
-    for task, gpus in (("ant", 2), ("humanoid", 2), *CHANNELS):
+    for task, gpus in CHANNELS:
         names = f"{task} multi", f"{task} uni"
         found = [ratio("async-channels", *names, key) if gpus == 2 else None for key in KEYS]
         pairs = CHANNELS.get((task, gpus), ())

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from benchmarks.evaluation.count import Count, of_figure, of_table
 from benchmarks.evaluation.figures import look_up
 from benchmarks.evaluation.page import TABLES
 from benchmarks.evaluation.plots import FOLDER, PICTURES, is_current
@@ -90,6 +91,19 @@ def check(root: Path = ROOT) -> list[Finding]:
             path = (FOLDER / f"{name}.svg").relative_to(ROOT).as_posix()
             found.append(Finding(path, 1, name, "its numbers are not those of the files"))
     return [*found, *without_commit()]
+
+
+def count(root: Path = ROOT) -> Count:
+    """The figures of all documents but decisions, whose figures are of their day."""
+    total = Count()
+    for path in documents(root):
+        if path.parent.name != "decisions":
+            text = path.read_text()
+            for match in FIGURE.finditer(text):
+                total += of_figure(match[2])
+            for match in TABLE.finditer(text):
+                total += of_table(match[2], match[3])
+    return total
 
 
 def without_commit(results: Path = RESULTS, plan: Path = PLAN) -> Iterator[Finding]:

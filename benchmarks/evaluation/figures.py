@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from benchmarks.records import RESULTS, Call, read_calls
@@ -58,6 +58,11 @@ def call_of(file: str) -> Call | None:
     return max(calls, key=lambda one: (_count(one[1].results), one[0]))[1]
 
 
+def measured(files: Iterable[str]) -> list[str]:
+    """Those that there are, each once."""
+    return [file for file in dict.fromkeys(files) if (RESULTS / f"{file}.json").exists()]
+
+
 def results_of(file: str) -> Mapping[str, Any]:
     """What that call measured; nothing without a file."""
     call = call_of(file)
@@ -73,6 +78,12 @@ def summaries(file: str, case: str) -> list[Mapping[str, Any]]:
     """Of the runs of a case that succeeded."""
     runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
     return [run["summary"] for run in runs if "summary" in run]
+
+
+def busy_sms(file: str, case: str) -> Figure | None:
+    """Part of the SMs that were busy in the runs of a case, 0 to 1."""
+    runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
+    return figure([run["busy_sms"] for run in runs if run.get("busy_sms") is not None])
 
 
 def ratio(file: str, case: str, base: str, key: str = TRAINING) -> float | None:
@@ -128,12 +139,17 @@ def look_up(reference: str) -> float:
     Raises:
       ConfigError: no call has it.
     """
+    medians = [statistics.median(found) for found in look_up_all(reference)[1]]
+    return medians[0] / medians[1] if len(medians) > 1 else medians[0]
+
+
+def look_up_all(reference: str) -> tuple[Call, list[list[float]]]:
+    """The call that `look_up` takes, and of each of its paths the values whose median it takes."""
     file, _, rest = reference.partition("#")
     for call in reversed(read_calls(RESULTS / file)):
         values = [list(_at(call.results, path.strip())) for path in rest.split(" over ")]
         if all(values):
-            medians = [statistics.median(found) for found in values]
-            return medians[0] / medians[1] if len(medians) > 1 else medians[0]
+            return call, values
     raise ConfigError(f"{file} has no {rest}")
 
 

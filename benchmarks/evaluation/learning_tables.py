@@ -6,29 +6,38 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from benchmarks.cases import TASKS
+from benchmarks.cases import REWARD, TASKS
 from benchmarks.evaluation.figures import (
     RATES,
     Figure,
     bounds,
     figure,
+    over,
     rate,
     results_of,
     shown,
 )
+from benchmarks.evaluation.seed_tables import of_algorithms
 from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
-from benchmarks.records import RESULTS, Call
+from benchmarks.outcomes import seconds_to
+from benchmarks.records import RESULTS, Call, calls_by_date
 from benchmarks.walking import SCRIPT
 
+NEARLY = 0.9
+"""Of a return, that is reached more surely than all of it."""
+
 MARKS = (
-    ("ant", 3000, "20 s", "async-long", "1 GPU, synchronous"),
-    ("humanoid", 5000, "under 240 s", "learn-humanoid", "humanoid"),
+    ("ant", 3000, "20 s", (("async-long", "1 GPU, synchronous"),)),
+    (
+        *("humanoid", 5000, "under 240 s"),
+        (("reward", "humanoid 1 x 8192"), ("learn-humanoid", "humanoid")),
+    ),
 )
-"""Task, return, what Isaac Gym publishes for it on an A100 (arXiv:2108.10470); file and case."""
+"""Task, return, what Isaac Gym publishes for it on an A100 (arXiv:2108.10470); files and cases."""
 
 
 def _learnt() -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    for path in sorted([*RESULTS.glob("learn-*.json"), *RESULTS.glob("entropy-franka_c*.json")]):
+    for path in sorted(RESULTS.glob("learn-*.json")):
         for name, case in results_of(path.stem)["cases"].items():
             if any("summary" in run for run in case["runs"]):
                 yield path.stem, name, case
@@ -61,12 +70,12 @@ def _metrics(runs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 @table(
     "marks",
     "task | return: | runs that reached it: | seconds, here: | Isaac Gym, on an A100:",
-    *(file for *_, file, _ in MARKS),
+    more=lambda: [_first(runs)[0] for *_, runs in MARKS],
 )
 def marks() -> Rows:
     """Seconds from the first report of a run alone on its GPU to a return that others publish."""
-    for task, mark, published, file, case in MARKS:
-        found = _times_to(mark, file, case)
+    for task, mark, published, runs in MARKS:
+        found = _times_to(mark, *_first(runs))
         reached = [seconds for seconds in found if seconds is not None]
         share = f"{len(reached)} of {len(found)}"
         yield [task, f"{mark:,}", share, shown(figure(reached), ".1f"), published]
@@ -74,17 +83,95 @@ def marks() -> Rows:
 
 def seconds_to_mark(task: str) -> Figure | None:
     """Seconds of training until a task reaches the return that Isaac Gym's authors give."""
-    ((mark, file, case),) = ((mark, *run) for name, mark, _, *run in MARKS if name == task)
-    return figure([s for s in _times_to(mark, file, case) if s is not None])
+    ((mark, runs),) = ((mark, runs) for name, mark, _, runs in MARKS if name == task)
+    return figure([s for s in _times_to(mark, *_first(runs)) if s is not None])
+
+
+def _first(runs: Sequence[tuple[str, str]]) -> tuple[str, str]:
+    """The first file and case that were measured, else the last."""
+    return next((one for one in runs if rate(*one)), runs[-1])
 
 
 def _times_to(mark: float, file: str, case: str) -> list[float | None]:
     """Of every run that was alone on its GPU; None of one that did not get there."""
     runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
     curves = [run["curve"] for run in runs if "curve" in run and "together" not in run]
+    return [seconds_to(mark, curve) for curve in curves]
+
+
+def _gmis(task: str) -> tuple[str, str]:
+    """The cases of figure 10: in one process, and in four GMIs."""
+    one, four = (f"{task} {gmis} x {8192 // gmis}" for gmis in (1, 4))
+    return one, four
+
+
+def _seconds_alike(task: str) -> tuple[float | None, list[Figure | None]]:
+    """Nine tenths of what one process reaches, and seconds to it in one process and in GMIs."""
+    one, four = _gmis(task)
+    if (final := rate("reward", one, "final_return")) is None:
+        return None, [None, None]
+    mark = NEARLY * final.median
+    seconds = (_times_to(mark, "reward", case) for case in (one, four))
+    return mark, [figure([s for s in found if s is not None]) for found in seconds]
+
+
+def seconds_over_one_process(task: str) -> float | None:
+    """Of four GMIs to the same return."""
+    one, four = _seconds_alike(task)[1]
+    return over(four, one)
+
+
+@table(
+    "reward",
+    "task | return at the end, one process: | four GMIs: | mark: | seconds to it, one process: | "
+    "four GMIs: | ratio:",
+    "reward",
+)
+def reward() -> Rows:
+    """The same training in one process and in four GMIs of the GPU."""
+    for task in REWARD:
+        mark, seconds = _seconds_alike(task)
+        finals = (shown(rate("reward", case, "final_return"), ",.0f") for case in _gmis(task))
+        cells = (shown(one, ".1f") for one in seconds)
+        gain = shown(seconds_over_one_process(task))
+        yield [f"`{task}`", *finals, shown(mark, ",.0f"), *cells, gain]
+
+
+def _of_algorithms() -> Calls:
+    """Of every task the newest call that trained it by several algorithms."""
+    calls = calls_by_date("seeds-*-nvidia-*.json")
+    return {call.results["task"]: (call, path) for call, path in calls if of_algorithms(call)}
+
+
+@table_of_calls(
+    "returns",
+    "task | trained by | million steps: | successes: | return at the end: | mark: | "
+    "seeds that reach it: | seconds of training to it:",
+    _of_algorithms,
+)
+def returns(calls: Calls) -> Rows:
+    """What algorithms reach beside the first one, whose nine tenths are the mark of a task."""
+    for task, (call, _) in sorted(calls.items()):
+        rows = call.results["rows"]
+        mark = NEARLY * rows[0]["return"][1] if rows and rows[0]["return"] else None
+        for row in rows:
+            yield _beside(task, row, mark)
+
+
+def _beside(task: str, row: Mapping[str, Any], mark: float | None) -> list[str]:
+    """Cells of an algorithm: what its seeds reach, and how many of them the mark, and when.
+
+    Seeds that were stopped count as they were then.
+    """
+    runs, seeds = [*row["each"], *row["cut"]], row["seeds"] + row["unfinished"]
+    curves = [one["curve"] for one in runs if one["curve"]]
+    finals = [one["final_return"] for one in runs if one["final_return"] is not None]
+    times = [] if mark is None else [seconds_to(mark, curve) for curve in curves]
+    reached = [s for s in times if s is not None]
     return [
-        next((s - curve[0][1] for _, s, found in curve if (found or 0.0) >= mark), None)
-        for curve in curves
+        *(f"`{task}`", row["row"], bounds([curve[-1][0] / 1e6 for curve in curves], ".0f")),
+        *(f"{row['successes']} of {seeds}", shown(figure(finals), ",.4g"), shown(mark, ",.4g")),
+        *(f"{len(reached)} of {seeds}", shown(figure(reached), ".0f")),
     ]
 
 
@@ -98,9 +185,10 @@ def throughput() -> Rows:
     for task in TASKS:
         for envs in (2048, 8192, 32768):
             for impl in ("jax", "warp"):
-                name = f"{task} {impl} {envs}"
-                cells = [shown(rate(f"tasks-{impl}", name, key), ",.0f") for key in RATES]
-                yield [f"`{task}`", f"{envs:,}", impl, *cells]
+                found = [rate(f"tasks-{impl}", f"{task} {impl} {envs}", key) for key in RATES]
+                if all(found):
+                    cells = (shown(one, ",.0f") for one in found)
+                    yield [f"`{task}`", f"{envs:,}", impl, *cells]
 
 
 def _kind_of_walking(call: Call) -> tuple[str, str, str | None, bool]:

@@ -1,108 +1,31 @@
-"""The tables beside training: serving, searches, reductions, faults, checks of a GPU."""
+"""The tables beside training: searches, reductions, faults, checks of a GPU."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from benchmarks import node_scaling as scaling
 from benchmarks.evaluation.figures import (
-    NOT_MEASURED,
     Figure,
     bounds,
     figure,
     results_of,
     shown,
 )
-from benchmarks.evaluation.writer import Rows, lines, source, table
-from benchmarks.paper_model import Task, serving_gain
-from benchmarks.records import RESULTS, read_calls
-
-SERVING, OLD_BACKENDS = "serving-nvidia-h200", "serving-backends-nvidia-h200"
-USE, REDUCTION = "resource-use-nvidia-h200", "reduction-nvidia-h200"
-IMPLS = {"ant": "jax", "humanoid": "warp"}
-"""Which MJX each task was served with."""
-
-SEARCHES = {
-    **{"search-ant-jax-h200": "jax", "search-ant-one_shot-h200": "warp"},
-    **{"search-ant-warp-7-and-1-h200": "warp", "search-ant-warp-1-h200": "warp"},
-}
-"""Files of searches on one GPU, and the MJX that is shown of each."""
-
-
-def serving_rate(file: str, name: str, impl: str | None = None) -> float | None:
-    """Steps/s of a serving case; several implementations may have one name in an old file."""
-    for case in results_of(file).get("cases", ()):
-        if case["name"] == name and impl in (None, case.get("impl", impl)):
-            return case["colocated"]
-    return None
-
-
-def backends_file() -> str:
-    """Which file has serving under both backends."""
-    cases = results_of(SERVING).get("cases", ())
-    return SERVING if any(case["backend"] == "share" for case in cases) else OLD_BACKENDS
-
-
-def mps_and_share(task: str, gmis: int) -> tuple[float | None, float | None]:
-    """Steps/s of serving with 8192 environments in all, under both backends."""
-    name, file = f"{task} {gmis} x {8192 // gmis}", backends_file()
-    mps, share = (
-        serving_rate(file, f"{name}, {backend}", IMPLS[task]) for backend in ("mps", "share")
-    )
-    return mps, share
-
-
-def mps_over_share(task: str, gmis: int) -> float | None:
-    """The ratio of the two."""
-    mps, share = mps_and_share(task, gmis)
-    return mps / share if mps and share else None
-
-
-@table(
-    "backends",
-    "task | GMIs x environments | `mps`, steps/s: | `share`, steps/s: | ratio: | MIG:",
-    more=lambda: [backends_file()],
+from benchmarks.evaluation.writer import (
+    Calls,
+    Rows,
+    lines,
+    made_with,
+    source,
+    table,
+    table_of_calls,
 )
-def backends() -> Rows:
-    """MPS against plain sharing."""
-    for task in IMPLS:
-        for gmis in (2, 3, 4, 8):
-            rates = (shown(value, ",.0f") for value in mps_and_share(task, gmis))
-            size = f"{gmis} x {8192 // gmis:,}"
-            yield [f"`{task}`", size, *rates, shown(mps_over_share(task, gmis)), NOT_MEASURED]
+from benchmarks.records import RESULTS, Call, calls_by_date, read_calls
 
-
-SERVING_HEAD = (
-    "GMIs that simulate | `tcg`, steps/s: | `tdg`, steps/s: | T_s, ms: | T_a, ms: | COM, ms: "
-    "| model: | measured:"
-)
-
-
-@table("serving-templates", SERVING_HEAD, SERVING)
-def serving_templates() -> Rows:
-    """Simulator and agent in one GMI against apart, with the paper's model."""
-    calls = reversed(read_calls(RESULTS / f"{SERVING}.json"))
-    timed = ([case for case in call.results["cases"] if "simulator_s" in case] for call in calls)
-    return [serving_row(case) for case in next(cases for cases in timed if cases)]
-
-
-def serving_row(case: Mapping[str, Any]) -> list[str]:
-    """A case of serving, of which one template may not have been measured."""
-    tcg, tdg = case.get("colocated"), case.get("dedicated")
-    times_s = [case.get(key) for key in ("simulator_s", "agent_s", "com_s")]
-    return [
-        *(case["name"], shown(tcg, ",.0f"), shown(tdg, ",.0f")),
-        *(shown(None if one is None else 1e3 * one) for one in times_s),
-        shown(predicted_gain(case) if "com_s" in case else None),
-        shown(tcg / tdg if tcg and tdg else None),
-    ]
-
-
-def predicted_gain(case: Mapping[str, Any]) -> float:
-    """Throughput of co-located over dedicated GMIs by equation 2, with the paper's R and alpha."""
-    simulator, agent = Task(case["simulator_s"], 10.0), Task(case["agent_s"], 1.0)
-    return serving_gain(simulator, agent, 0.2, case["com_s"])
+USE = "resource-use-nvidia-h200"
 
 
 @table("resource-use", "task | stage | time in an iteration, ms: | SMs busy: | memory:", USE)
@@ -115,20 +38,42 @@ def resource_use() -> Rows:
             yield [f"`{task}`", stage, *cells]
 
 
-@table("search", "search | MJX | GMIs x environments | steps/s of the GPU: |", *SEARCHES)
-def search() -> Rows:
-    """Points of the searches: GMIs and environments of each."""
-    for file, impl in SEARCHES.items():
-        results = results_of(file)
-        for p in results.get("points", ()):
-            if p["impl"] == impl and p.get("projected"):
-                best = "**answer**" if _is_answer(p, results["best"]) else ""
-                size = f"{p['gmis_per_gpu']} x {p['num_envs']:,}"
-                yield [f"`{file}`", impl, size, f"{p['projected']:,.0f}", best]
+def _searches() -> Calls:
+    """By task, the newest call that searched it."""
+    found: dict[str, tuple[Call, Path]] = {}
+    for call, path in calls_by_date("search*.json"):
+        rows = call.results.get("rows") or [call.results]  # An old file is one search.
+        found |= {row["env"]: (call, path) for row in rows if "best" in row}
+    return found
 
 
-def _is_answer(point: dict[str, Any], best: dict[str, Any]) -> bool:
-    return all(point[key] == best[key] for key in ("gmis_per_gpu", "num_envs", "impl"))
+def answers() -> dict[str, Mapping[str, Any]]:
+    """What the newest search of each task found."""
+    rows = {}
+    for task, (call, _) in sorted(_searches().items()):
+        searched = call.results.get("rows") or [call.results]
+        rows[task] = next(row for row in searched if row.get("env") == task)
+    return rows
+
+
+@table_of_calls(
+    "search",
+    "task | answer: GMIs x environments | MJX | its steps/s: | over the best point: | "
+    "over the best point with one GMI: | profiles: | seconds:",
+    _searches,
+)
+def search(_: Calls) -> Rows:
+    """What Algorithm 2 chooses, beside the points that it measured."""
+    for task, row in answers().items():
+        best, points = row["best"], [p for p in row["points"] if p.get("projected")]
+        alone = [p["projected"] for p in points if p["gmis_per_gpu"] == 1]
+        yield [
+            *(f"`{task}`", f"{best['gmis_per_gpu']} x {best['num_envs']:,}", best["impl"]),
+            f"{best['projected']:,.0f}",
+            shown(best["projected"] / max(p["projected"] for p in points)),
+            shown(best["projected"] / max(alone) if alone else None),
+            *(str(len(row["points"])), f"{row['wall_s']:.0f}"),
+        ]
 
 
 REDUCTION_HEAD = (
@@ -136,10 +81,10 @@ REDUCTION_HEAD = (
 )
 
 
-@table("reduction", REDUCTION_HEAD, REDUCTION)
-def reduction() -> Rows:
+@table_of_calls("reduction", REDUCTION_HEAD, scaling.reductions)
+def reduction(calls: Calls) -> Rows:
     """A mean of 1.5 million numbers, alone and in a chain."""
-    rows = results_of(REDUCTION).get("rows", ())
+    rows = [row for call, _ in calls.values() for row in call.results["rows"]]
     return [reduction_row(row) for row in rows if row["num_floats"] == 1_500_000]
 
 
@@ -160,7 +105,7 @@ def read_layout(text: str) -> str:
 
 def model_fit() -> str:
     """Measured over predicted time of all reductions of the paper's strategies."""
-    rows = results_of(REDUCTION).get("rows", ())
+    rows = scaling.reduction_results().get("rows", ())
     fits = [row["median_s"] / row["predicted_s"] for row in rows if row["predicted_s"]]
     return bounds(fits, ".3g")
 
@@ -173,7 +118,8 @@ def node_scaling() -> list[str]:
         f"Measured over predicted time of a mean on one node, one GMI on each GPU: "
         f"{' and '.join(fits)}; all strategies and layouts: {model_fit()}."
     )
-    return [*scaling.table(), "", fit, *source(scaling.BANDWIDTHS, scaling.RATES)]
+    below = [*source(scaling.RATES), *made_with(scaling.reductions())]
+    return [*scaling.table(), "", fit, *below]
 
 
 @table("faults", "fault | seconds until all GMIs train again:", "faults-h200")
@@ -230,16 +176,3 @@ def sm_shares() -> Rows:
         verdict = f"**wrong** ({', '.join(sorted(wrong))})" if wrong else "right"
         rates = [f"{value:.0f}" for value in row["tflops"].values()]
         yield [f"{row['sm_percent']:g}", str(row["num_sms"]), verdict, *rates]
-
-
-@table(
-    "stencil",
-    "grid | backend | four GMIs, us a step: | one process, us: | times slower:",
-    "stencil-nvidia-h200",
-)
-def stencil() -> Rows:
-    """Four GMIs that share a grid against one process."""
-    for run in results_of("stencil-nvidia-h200").get("runs", ()):
-        slower = run["us_per_step"] / run["one_us_per_step"]
-        times = (f"{run[key]:.0f}" for key in ("us_per_step", "one_us_per_step"))
-        yield [run["size"], f"`{run['backend']}`", *times, f"{slower:.2f}"]

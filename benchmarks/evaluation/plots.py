@@ -14,15 +14,14 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as Picture
 from matplotlib.transforms import blended_transform_factory
 
-from benchmarks.evaluation.figures import ratio
-from benchmarks.evaluation.other_tables import IMPLS, mps_over_share
 from benchmarks.evaluation.paper import lgr_gain
+from benchmarks.evaluation.serving_tables import TASKS, mps_over_share
 from benchmarks.evaluation.sweep_tables import first_gains
 from benchmarks.evaluation.tables import (
     LAYOUTS,
     fixed_total_ratios,
     over_one_gpu,
-    small_gmis,
+    reduction_gain,
 )
 from gmijax.runs.folder import write_text
 
@@ -37,16 +36,11 @@ PAPER = "paper"
 
 def summary() -> Groups:
     """What several GMIs on a GPU gain and lose, in the order of the advice."""
-    small = small_gmis()
     return {
         "small training runs at once, over one after another": {
             way.removesuffix(", auto"): gain.median
             for way, gain in first_gains().items()
             if way.endswith(", auto")
-        },
-        "GMIs of one small training run, over one such GMI": {
-            f"{gmis} GMIs": small[gmis] / small[1] if {1, gmis} <= small.keys() else None
-            for gmis in (4, 10)
         },
         "serving under MPS, over plain sharing": mps_gains(),
         "one large training run in several GMIs, over one process": one_training(),
@@ -58,7 +52,7 @@ def summary() -> Groups:
 
 def mps_gains() -> Bars:
     """Serving under MPS over plain sharing, with the fewest and the most GMIs."""
-    return {f"{task}, {n} GMIs": mps_over_share(task, n) for task in IMPLS for n in (2, 8)}
+    return {f"{task}, {n} GMIs": mps_over_share(task, n) for task in TASKS for n in (2, 8)}
 
 
 def one_training() -> Bars:
@@ -78,7 +72,7 @@ def lgr() -> Groups:
     for task in ("ant", "humanoid", "shadow_hand"):
         bars = groups.setdefault(task, {})
         for at, name in LAYOUTS.items():
-            bars[name] = ratio(f"lgr-{task}-one_shot", f"{at} one_shot", f"{at} mpr")
+            bars[name] = reduction_gain(task, at, "one_shot")
             bars[f"{name}, {PAPER}"] = lgr_gain(task, at)
     return groups
 

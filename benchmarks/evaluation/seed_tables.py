@@ -7,18 +7,24 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cases import SUITES
-from benchmarks.evaluation.figures import TRAINING, figure, rate, shown, summaries
-from benchmarks.evaluation.writer import Calls, Rows, table, table_of_calls
+from benchmarks.evaluation.figures import shown
+from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
 from benchmarks.records import Call, calls_by_date
 
 PATTERN = "seeds-*-nvidia-*.json"
 PLAYGROUND = "playground-"
 
 
+def of_algorithms(call: Call) -> bool:
+    """Whether its rows are of different algorithms, and not settings of one."""
+    overrides = (one for row in call.results["rows"] for one in row["overrides"])
+    return any(one.startswith("algo=") for one in overrides)
+
+
 def _calls(*, of_playground: bool) -> list[tuple[Call, Path]]:
     """With Playground's tasks or with the others, by task, those of a task in order of date."""
-    found = sorted(calls_by_date(PATTERN), key=lambda one: one[0].results["task"])
+    calls = [one for one in calls_by_date(PATTERN) if not of_algorithms(one[0])]
+    found = sorted(calls, key=lambda one: one[0].results["task"])
     return [one for one in found if one[0].results["task"].startswith(PLAYGROUND) == of_playground]
 
 
@@ -111,21 +117,3 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 
 def _changed(row: Mapping[str, Any]) -> str:
     return ", ".join(f"`{override}`" for override in row["overrides"]) or "nothing"
-
-
-@table(
-    "playground",
-    "task | million steps: | steps/s: | seconds of training: | return at the end:",
-    "playground",
-)
-def playground() -> Rows:
-    """What tasks of Playground reach with its own settings, in evaluations without noise."""
-    for case in SUITES["playground"]:
-        found = summaries("playground", case.name)
-        steps = figure([one["env_steps"] / 1e6 for one in found])
-        trained, seconds, last = (
-            rate("playground", case.name, key)
-            for key in (TRAINING, "train_wall_s", "eval/last/return")
-        )
-        cells = (shown(one, ",.0f") for one in (steps, trained, seconds))
-        yield [case.name, *cells, shown(last, ",.4g")]

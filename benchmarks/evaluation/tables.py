@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 
 from benchmarks.cases import PLANS, TASKS
 from benchmarks.evaluation.figures import (
     Figure,
-    call_of,
+    busy_sms,
     figure,
+    measured,
     over,
     rate,
     ratio,
@@ -22,38 +24,52 @@ from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import select_strategy
 
 LAYOUTS = {"2G2T": "2 GPUs x 2", "2G3T": "2 GPUs x 3", "4G4T": "4 GPUs x 4"}
-TWO_TREES = "exchange-in-program-h200"
+TWO_TREES, SCALING = "exchange-in-program-h200", "scaling"
+WEAK = (SCALING, "scaling-4gpu", "scaling-one_shot")
+"""Files of weak scaling; with several names, one after the other."""
+
+
+def scaling(gpus: int, gmis: int) -> str:
+    """The name of a case of `WEAK`."""
+    return f"{gpus} GPUs x {gmis} GMIs x {8192 // gmis}"
+
+
 ONE_GPU = (
     *(
-        ("4 GMIs, MJX-JAX", file, "4 GMIs x 2048, mps", "1 GMI x 8192")
-        for file in ("ant-1gpu-one_shot", "ant-1gpu")
-    ),
-    *(
-        ("2 GMIs, MJX-Warp", file, "1 GPUs x 2 GMIs x 4096", "1 GPUs x 1 GMIs x 8192")
-        for file in ("scaling-one_shot", "scaling")
+        (f"{gmis} GMIs, MJX-Warp", file, scaling(1, gmis), scaling(1, 1))
+        for file in (SCALING, "scaling-one_shot")
+        for gmis in (2, 4)
     ),
     ("2 GMIs, MJX-Warp", TWO_TREES, "2x4096", "1x8192"),
     ("4 GMIs, MJX-Warp", TWO_TREES, "4x2048", "1x8192"),
+    ("4 GMIs, MJX-JAX", "ant-1gpu", "4 GMIs x 2048, mps", "1 GMI x 8192"),
 )
 """What, file, several GMIs, one process: ant, 8192 environments on a GPU, under MPS."""
 
 OTHERS = (
     ("4 GMIs, MJX-JAX, no MPS", "ant-1gpu", "4 GMIs x 2048, share", "1 GMI x 8192"),
+    ("4 GMIs, MJX-Warp, no MPS", SCALING, f"{scaling(1, 4)}, share", scaling(1, 1)),
     ("2 GPUs, 2 GMIs on each, MJX-Warp", TWO_TREES, "2gpu-2x4096", "2gpu-1x8192"),
     *(
-        (
-            *(f"{gpus} GPUs, 2 GMIs on each, MJX-Warp", "scaling"),
-            *(f"{gpus} GPUs x 2 GMIs x 4096", f"{gpus} GPUs x 1 GMIs x 8192"),
-        )
+        (f"{gpus} GPUs, 2 GMIs on each, MJX-Warp", SCALING, scaling(gpus, 2), scaling(gpus, 1))
         for gpus in (2, 4)
     ),
 )
 """The same without MPS, and on more GPUs against one process on each."""
 
+BACKENDS = (
+    *(
+        (scaling(gpus, gmis), "MJX-Warp", SCALING, scaling(gpus, gmis))
+        for gpus, gmis in ((1, 4), (2, 2))
+    ),
+    ("4 GMIs x 2048", "MJX-JAX", "ant-1gpu", "4 GMIs x 2048, mps"),
+    ("2 GPUs x 2 GMIs x 2048", "MJX-JAX", "ant-2gpu", "2 GPUs x 2 GMIs x 2048, mps"),
+)
+"""What, physics, file, case under MPS; that of plain sharing ends with `share`."""
+
 IN_GPU_MEMORY = ("one_shot", "auto")
 """Exchanges that do not pass the host: `auto` where a file does not say what it became."""
 
-SMALL = "search-ant-one_shot-h200"
 TEMPLATES = ("2 GMIs x 2048, tcg_ex", "2 + 1 GMIs x 2048, tdg_ex")
 
 
@@ -83,25 +99,26 @@ def exchange_of(file: str, case: str) -> str:
     return found[0]["plan"]["strategy"] if found else "auto"
 
 
-def fixed_total_ratios() -> dict[str, float | None]:
+def fixed_total_ratios() -> dict[str, float]:
     """Several GMIs on one GPU over one process with as many environments, as jobs exchange now."""
     return {
-        f"{what} ({file})": over(*pair(file, case, base))
+        f"{what} ({file})": gain
         for what, file, case, base in ONE_GPU
         if exchange_of(file, case) in IN_GPU_MEMORY
+        and (gain := over(*pair(file, case, base))) is not None
     }
 
 
 @table(
     "fixed-total",
     "on each GPU | exchange | GMIs, steps/s: | one process, steps/s: | ratio: | file",
-    *dict.fromkeys(file for _, file, *_ in (*ONE_GPU, *OTHERS)),
+    more=lambda: measured(file for _, file, *_ in (*ONE_GPU, *OTHERS)),
 )
 def fixed_total() -> Rows:
     """The same environments in one process on each GPU, and in several."""
     for what, file, case, base in (*ONE_GPU, *OTHERS):
-        found = compared(*pair(file, case, base))
-        yield [what, f"`{exchange_of(file, case)}`", *found, f"`{file}`"]
+        if all(found := pair(file, case, base)):
+            yield [what, f"`{exchange_of(file, case)}`", *compared(*found), f"`{file}`"]
 
 
 def fastest(task: str, *, several: bool) -> tuple[Figure, str] | None:
@@ -138,37 +155,66 @@ def best_plans() -> Rows:
 
 @table(
     "training-backends",
-    "ant, MJX-JAX | exchange | `mps`, steps/s: | `share`, steps/s: | ratio:",
-    *("ant-1gpu", "ant-2gpu"),
+    "ant | MJX | exchange | `mps`, steps/s: | `share`, steps/s: | ratio:",
+    more=lambda: measured(file for _, _, file, _ in BACKENDS),
 )
 def training_backends() -> Rows:
     """MPS against plain sharing, in training."""
-    for file, what in (("ant-1gpu", "4 GMIs x 2048"), ("ant-2gpu", "2 GPUs x 2 GMIs x 2048")):
-        mps, share = (f"{what}, {backend}" for backend in ("mps", "share"))
-        yield [what, f"`{exchange_of(file, mps)}`", *compared(*pair(file, mps, share))]
+    for what, impl, file, mps in BACKENDS:
+        if all(found := pair(file, mps, f"{mps.removesuffix(', mps')}, share")):
+            yield [what, impl, f"`{exchange_of(file, mps)}`", *compared(*found)]
 
 
 @table(
     "weak-scaling",
     "GPUs x GMIs x environments | exchange | steps/s: | over one GPU: | of ideal:",
-    *("scaling", "scaling-one_shot"),
+    more=lambda: measured(WEAK),
 )
 def weak_scaling() -> Rows:
     """8192 environments on every GPU."""
-    for file, gmis, way in (
-        *(("scaling", 1, "`flat`"), ("scaling-one_shot", 2, "`one_shot`")),
-        ("scaling", 2, "`har`"),
-    ):
-        for gpus in (1, 2, 4, 8):
-            name, alone = (f"{n} GPUs x {gmis} GMIs x {8192 // gmis}" for n in (gpus, 1))
-            gain = ratio(file, name, alone)
-            cells = [shown(rate(file, name), ",.0f"), shown(gain), shown(gain and gain / gpus)]
-            yield [f"{gpus} x {gmis} x {8192 // gmis:,}", way, *cells]
+    for file, gmis, gpus in product(WEAK, (1, 2), (1, 2, 4)):
+        name, way = scaling(gpus, gmis), exchange_of(file, scaling(2, gmis))
+        gain = ratio(file, name, scaling(1, gmis))
+        has_several = rate(file, scaling(2, gmis)) is not None
+        if gain and has_several and (gmis == 1 or way in IN_GPU_MEMORY):
+            cells = [shown(rate(file, name), ",.0f"), shown(gain), shown(gain / gpus)]
+            yield [f"{gpus} x {gmis} x {8192 // gmis:,}", f"`{way}`", *cells]
 
 
 def over_one_gpu(gpus: int) -> float | None:
     """Steps/s of several GPUs with one GMI on each, over those of one GPU."""
-    return ratio("scaling", f"{gpus} GPUs x 1 GMIs x 8192", "1 GPUs x 1 GMIs x 8192")
+    gains = (ratio(file, scaling(gpus, 1), scaling(1, 1)) for file in WEAK)
+    return next((gain for gain in gains if gain), None)
+
+
+def _jobs_of_one_gpu() -> Iterator[tuple[str, str, str, str]]:
+    """Task, GMIs and environments, file, case: of one process first."""
+    for gmis in (1, 2, 4):
+        yield "ant", f"{gmis} x {8192 // gmis:,}", SCALING, scaling(1, gmis)
+    for task in TASKS:
+        for gmis, num_envs in PLANS:
+            yield task, f"{gmis} x {num_envs:,}", "plans", f"{task} {gmis} x {num_envs}"
+
+
+def busy_in_jobs(*, several: bool) -> list[float | None]:
+    """Part of the SMs that trainings of one GPU keep busy, in one process or in several GMIs."""
+    return [
+        found and found.median
+        for _, size, file, case in _jobs_of_one_gpu()
+        if size.startswith("1 x") != several and (found := busy_sms(file, case))
+    ]
+
+
+@table(
+    "busy-jobs",
+    "training | GMIs x environments | steps/s: | SMs busy:",
+    more=lambda: measured(file for _, _, file, case in _jobs_of_one_gpu() if busy_sms(file, case)),
+)
+def busy_jobs() -> Rows:
+    """What whole trainings take of a GPU."""
+    for task, size, file, case in _jobs_of_one_gpu():
+        if busy := busy_sms(file, case):
+            yield [f"`{task}`", size, shown(rate(file, case), ",.0f"), shown(busy, ".0%")]
 
 
 @table(
@@ -190,11 +236,15 @@ def algorithm_1(at: str) -> str:
 
 def with_and_without(task: str, at: str, way: str) -> tuple[Figure | None, Figure | None]:
     """Steps/s of a reduction on a layout, and of `mpr`: of the same call where that has both."""
-    file = f"lgr-{task}-one_shot" if way == "one_shot" else f"lgr-{task}"
-    # Runs of rings that were made by themselves.
-    alone = f"lgr-{task}-{way}"
-    own = rate(file, f"{at} {way}") or rate(alone, f"{at} {way}")
-    return own, rate(file, f"{at} mpr")
+    pairs = [(rate(file, f"{at} {way}"), rate(file, f"{at} mpr")) for file in measured(_lgr(task))]
+    own, mpr = ([one for one in side if one] for side in zip(*pairs, strict=True))
+    alone = (own[0] if own else None, mpr[0] if mpr else None)
+    return next((pair for pair in pairs if all(pair)), alone)
+
+
+def _lgr(task: str) -> tuple[str, ...]:
+    """Files of a task; those with more in their names are of single strategies."""
+    return tuple(f"lgr-{task}{way}" for way in ("", "-one_shot", "-mrr"))
 
 
 def reduction_gain(task: str, at: str, way: str) -> float | None:
@@ -202,16 +252,11 @@ def reduction_gain(task: str, at: str, way: str) -> float | None:
     return over(*with_and_without(task, at, way))
 
 
-def _lgr_files() -> Iterator[str]:
-    for task in LGR:
-        yield from filter(call_of, (f"lgr-{task}{way}" for way in ("-one_shot", "", "-mrr")))
-
-
 @table(
     "lgr",
     "task | GMIs | exchange | by Algorithm 1 | `mpr`, steps/s: | steps/s: | ratio: | "
     "the paper's LGR:",
-    more=_lgr_files,
+    more=lambda: measured(file for task in LGR for file in _lgr(task)),
 )
 def lgr() -> Rows:
     """Every reduction that was measured in training against `mpr`."""
@@ -239,29 +284,5 @@ def num_env() -> Rows:
             for envs in (512, 2048, 8192, 32768):
                 name, file = f"{task} {impl} {envs}", f"tasks-{impl}"
                 found = rate(file, name), rate(file, name, "device/peak_memory_mib")
-                yield [f"`{task}`", f"{envs:,}", impl, *(shown(one, ",.0f") for one in found)]
-
-
-def small_gmis() -> dict[int, float]:
-    """Steps/s of a GPU by the number of GMIs with 2,048 environments each, MJX-Warp."""
-    return {
-        point["gmis_per_gpu"]: point["projected"]
-        for point in results_of(SMALL).get("points", ())
-        if (point["impl"], point["num_envs"]) == ("warp", 2048)
-    }
-
-
-@table(
-    "many-small",
-    "GMIs x environments each, ant, MJX-Warp | steps/s of the GPU: | over one:",
-    SMALL,
-)
-def many_small() -> Rows:
-    """What a GPU makes of several small processes."""
-    rates = small_gmis()
-    for gmis, value in sorted(rates.items()):
-        yield [
-            f"{gmis} x 2,048",
-            f"{value:,.0f}",
-            shown(value / rates[1] if 1 in rates else None),
-        ]
+                if all(found):
+                    yield [f"`{task}`", f"{envs:,}", impl, *(shown(one, ",.0f") for one in found)]

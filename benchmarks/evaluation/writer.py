@@ -32,8 +32,12 @@ def table(
       more: such files, where results say which.
     """
 
+    def make(rows: MakeRows) -> list[str]:
+        found = [*rows()]
+        return [*markdown(head, found), *source(*files, *more())] if found else [NOT_MEASURED]
+
     def register(rows: MakeRows) -> MakeRows:
-        TABLES[name] = lambda: [*markdown(head, [*rows()]), *source(*files, *more())]
+        TABLES[name] = lambda: make(rows)
         return rows
 
     return register

@@ -5,18 +5,39 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from benchmarks.cases import SUITES
-from benchmarks.evaluation import check, tables
+from benchmarks.evaluation import check, figures, tables
 from benchmarks.evaluation.async_tables import over_the_same_ratio
+from benchmarks.evaluation.count import of_figure, of_table
 from benchmarks.evaluation.figures import look_up
 from benchmarks.evaluation.page import TABLES
 from gmijax.errors import ConfigError
 
-REFERENCE = "ant-1gpu.json#4 GMIs x 2048, mps/step_per_s_train"
-MARKED = f"<!-- figure: {REFERENCE} over 1 GMI x 8192/step_per_s_train .2f -->%s<!-- /figure -->\n"
+REFERENCE = "runs.json#four, mps/step_per_s_train"
+MARKED = f"<!-- figure: {REFERENCE} over one/step_per_s_train .2f -->%s<!-- /figure -->\n"
+
+
+def write_results(folder: Path, name: str, cases: Any, commit: str | None = "1234567") -> None:
+    call = {"commit": commit, "date": "2026-11-27", "results": {"cases": cases}}
+    (folder / f"{name}.json").write_text(json.dumps({"format": 2, "calls": [call]}))
+
+
+def runs(*rates: float) -> dict[str, Any]:
+    return {"runs": [{"summary": {"step_per_s_train": rate}} for rate in rates]}
+
+
+@pytest.fixture
+def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of results that has one file."""
+    folder = tmp_path / "results"
+    folder.mkdir()
+    monkeypatch.setattr(figures, "RESULTS", folder)
+    write_results(folder, "runs", {"four, mps": runs(70.0, 72.0, 90.0), "one": runs(100.0)})
+    return folder
 
 
 def findings(folder: Path, text: str) -> list[str]:
@@ -32,11 +53,21 @@ def test_every_figure_of_the_documents_is_that_of_its_file():
 
 def test_lgr_is_what_algorithm_1_of_the_paper_takes():
     taken = {"2G2T": "mrr", "2G3T": "har", "4G4T": "mrr"}
-    pairs = [f"{at} {way}" for at, strategy in taken.items() for way in ("mpr", strategy)]
-    assert [case.name for case in SUITES["lgr-ant"]] == pairs
+    ways = [
+        f"{at} {way}" for at, strategy in taken.items() for way in ("mpr", strategy, "one_shot")
+    ]
+    assert [case.name for case in SUITES["lgr-ant"]] == ways
     assert {at: tables.algorithm_1(at) for at in tables.LAYOUTS} == taken
-    measured = tables.reduction_gain("ant", "2G2T", "mrr")  # By itself, in a file of its own.
-    assert measured == pytest.approx(0.99, abs=0.005)
+
+
+def test_reductions_are_compared_in_one_call_if_one_has_both(results: Path):
+    write_results(results, "lgr-ant", {"2G2T mpr": runs(100.0)})
+    write_results(results, "lgr-ant-mrr", {"2G2T mrr": runs(50.0)})
+    assert tables.reduction_gain("ant", "2G2T", "mrr") == 0.5
+    assert tables.reduction_gain("ant", "2G2T", "one_shot") is None
+    both = {"2G2T mpr": runs(200.0), "2G2T one_shot": runs(300.0)}
+    write_results(results, "lgr-ant-one_shot", both)
+    assert tables.reduction_gain("ant", "2G2T", "one_shot") == 1.5
 
 
 def test_every_table_stands_in_one_page_of_the_evaluation():
@@ -56,13 +87,15 @@ def test_a_figure_of_the_front_page_is_of_three_runs_at_least():
     assert min(repeats) >= 3
 
 
+@pytest.mark.usefixtures("results")
 def test_a_wrong_digit_is_found(tmp_path: Path):
     assert findings(tmp_path, "a\n" + MARKED % "0.72") == []
     (found,) = findings(tmp_path, "a\n" + MARKED % "0.73")
-    assert found.startswith("README.md:2: '0.73': ant-1gpu.json#")
+    assert found.startswith("README.md:2: '0.73': runs.json#")
     assert found.endswith(" is 0.72")
 
 
+@pytest.mark.usefixtures("results")
 def test_a_decision_says_that_its_figures_are_of_their_day(tmp_path: Path):
     path = tmp_path / "docs" / "decisions" / "why.md"
     path.parent.mkdir(parents=True)
@@ -76,18 +109,20 @@ def test_a_decision_says_that_its_figures_are_of_their_day(tmp_path: Path):
 
 
 def test_a_wrong_digit_in_a_table_is_found(tmp_path: Path):
-    text = check.fill("<!-- table: templates -->\n<!-- /table -->\n")
+    text = check.fill("<!-- table: async-long -->\n<!-- /table -->\n")
     assert findings(tmp_path, text) == []
-    (found,) = findings(tmp_path, text.replace("| 1.29 |", "| 1.39 |"))
-    assert found.startswith("README.md:4: '| `ant` |")
-    assert "| 1.29 |" in found
+    row = text.splitlines()[4]
+    (found,) = findings(tmp_path, text.replace(row, row.replace("1", "2")))
+    assert found.startswith(f"README.md:5: {row.replace('1', '2')!r}: the files say")
+    assert row in found
 
 
+@pytest.mark.usefixtures("results")
 @pytest.mark.parametrize(
     ("marked", "said"),
     [
         ("figure: none.json#a/b .2f -->0.72<!-- /figure", "no such file of results"),
-        (f"figure: {REFERENCE} over none/a .2f -->0.72<!-- /figure", "ant-1gpu.json has no"),
+        (f"figure: {REFERENCE} over none/a .2f -->0.72<!-- /figure", "runs.json has no"),
         ("table: none -->\n<!-- /table", "table none: allowed are advice, "),
     ],
 )
@@ -120,12 +155,14 @@ def test_prose_needs_no_marks(tmp_path: Path):
     assert findings(tmp_path, text) == []
 
 
-def test_paths_take_medians_names_and_keys_with_slashes():
-    assert look_up(REFERENCE) == pytest.approx(1_180_954, abs=1)  # The second of three.
-    assert look_up("serving-nvidia-h200.json#ant 1 x 8192, mps/colocated") > 1e6
-    assert look_up("templates-ant.json#2 GMIs x 2048, tcg_ex/runs/0/medians/time/rollout_s") < 1
+def test_paths_take_medians_names_and_keys_with_slashes(results: Path):
+    assert look_up(REFERENCE) == 72.0  # The second of three.
+    listed = [{"name": "ant 1 x 8192, mps", "colocated": 5, "medians": {"time/rollout_s": 0.5}}]
+    write_results(results, "listed", listed)
+    assert look_up("listed.json#ant 1 x 8192, mps/colocated") == 5
+    assert look_up("listed.json#cases/0/medians/time/rollout_s") == 0.5
     with pytest.raises(ConfigError, match="has no"):
-        look_up("ant-1gpu.json#4 GMIs x 2048, mps/none")
+        look_up("runs.json#four, mps/none")
 
 
 def test_free_gmis_are_compared_with_one_program_of_their_ratio():
@@ -135,6 +172,44 @@ def test_free_gmis_are_compared_with_one_program_of_their_ratio():
         "two_gmis": {"free_rounds_per_s": 50.0, "free_updates_per_s": 100.0},
     }
     assert over_the_same_ratio(repeat) == pytest.approx(1.5)
+
+
+HEAD = "| task | environments | steps/s | ratio |\n| --- | ---: | ---: | ---: |\n"
+KNOWN = "- [`a.json`](a): commit 1234567, 2026-11-27, 1 x NVIDIA H200"
+UNKNOWN = "- [`b.json`](b): commit unknown, date unknown, NVIDIA H200, 3 runs of each case"
+
+
+@pytest.mark.parametrize(
+    ("rows", "sources", "counted"),
+    [
+        # Environments are no figure; a ratio is of as many runs as what it is of.
+        (["| ant | 8 | 5 (4 to 6, n=3) | 1.2 |"], [KNOWN], (2, 2)),
+        (["| ant | 8 | 5 (4 to 6, n=2) | 1.2 |"], [KNOWN], (2, 0)),
+        (["| ant | 8 | 5 | 1.2 |"], [KNOWN], (2, 0)),
+        (["| ant | 8 | 5 | 1.2 |"], [f"{KNOWN}, 3 runs of each case"], (2, 2)),
+        (["| ant | 8 | 5 | 1.2 |"], [f"{KNOWN}, 1 to 3 runs of each case"], (2, 0)),
+        (["| ant | 8 | 5 of 20 | not measured |"], [KNOWN], (1, 1)),
+        (["| ant | 8 | 5 | 1.2 |"], [UNKNOWN], (2, 0)),
+        # A row may say which file it is from.
+        (
+            ["| `b` | 8 | 5 (4 to 6, n=3) |  |", "| `a` | 8 | 5 (4 to 6, n=3) |  |"],
+            [KNOWN, UNKNOWN],
+            (2, 1),
+        ),
+    ],
+)
+def test_figures_are_counted(rows: list[str], sources: list[str], counted: tuple[int, int]):
+    text = HEAD + "\n".join([*rows, "", *sources]) + "\n"
+    assert of_table("any", text) == counted
+    assert of_table("node-scaling", text) == (0, 0)
+
+
+def test_marked_figures_are_counted(results: Path):
+    assert of_figure(REFERENCE) == (1, 1)
+    assert of_figure(f"{REFERENCE} over one/step_per_s_train") == (1, 0)  # Of one run.
+    write_results(results, "runs", {"four, mps": runs(1.0, 2.0, 3.0)}, commit=None)
+    assert of_figure(REFERENCE) == (1, 0)
+    assert of_figure("none.json#a") == (1, 0)
 
 
 def test_results_without_a_commit_are_planned_again(tmp_path: Path):

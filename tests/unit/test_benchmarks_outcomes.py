@@ -13,6 +13,8 @@ from benchmarks.outcomes import (
     against,
     outcome_of,
     quartiles,
+    return_curve,
+    seconds_to,
     succeeded,
     summary,
     wilson,
@@ -20,7 +22,10 @@ from benchmarks.outcomes import (
 
 
 def lines(rewards: Sequence[float], **others: Any) -> list[dict[str, Any]]:
-    return [{"reward_per_step": reward, **others} for reward in rewards]
+    return [
+        {"env_steps": 64 * n, "wall_s": 0.5 * n, "reward_per_step": reward, **others}
+        for n, reward in enumerate(rewards)
+    ]
 
 
 def outcome(final: float, *, ok: bool) -> Outcome:
@@ -71,6 +76,18 @@ def test_an_outcome_has_what_the_last_iterations_show() -> None:
     found = lines([1.0] * 20)
     assert outcome_of("ball_balance", found, seed="", completed=True, wall_s=0.0).succeeded
     assert not outcome_of("ball_balance", found, seed="", completed=False, wall_s=0.0).succeeded
+
+
+def test_seconds_to_a_mark_are_counted_from_the_first_line() -> None:
+    found = lines([1.0] * 200, **{"return": None})
+    for line in found[100:]:
+        line |= {"return": -line["env_steps"]}
+    curve = return_curve(found)
+    assert len(curve) < 80
+    assert (curve[0][:2], curve[-1][:2]) == ((0, 0.0), (64 * 199, 99.5))
+    assert seconds_to(-8000.0, curve[5:]) == pytest.approx(102 * 0.5 - curve[5][1], abs=1.0)
+    assert seconds_to(0.0, curve) is None
+    assert return_curve([]) == []
 
 
 def test_wilsons_interval() -> None:

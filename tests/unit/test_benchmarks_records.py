@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from benchmarks import records
-from benchmarks.records import COMMIT_VARIABLE, RESULTS, ResultsFile, read_calls
+from benchmarks.records import COMMIT_VARIABLE, RESULTS, ResultsFile, add_calls, read_calls
 from gmijax.errors import ConfigError
 
 
@@ -42,6 +42,20 @@ def test_calls_that_go_on_at_the_same_time_keep_each_other(file: Path):
         with book.changing() as results:
             results["number"] = number
     assert sorted(call.results["number"] for call in read_calls(file)) == [1, 2]
+
+
+def test_calls_of_another_machine_are_added_once(file: Path, tmp_path: Path):
+    results = tmp_path / "results"
+    results.mkdir()
+    add(results / file.name, 1)
+    add(file, 2)
+    for _ in range(2):
+        add_calls([file], results)
+    calls = read_calls(results / file.name)
+    assert [call.results["number"] for call in calls] == [1, 2]
+    assert calls[1] == read_calls(file)[0]
+    with pytest.raises(ConfigError, match="no such file of results"):
+        add_calls([tmp_path / "none.json"], results)
 
 
 def test_only_a_call_of_the_same_code_is_gone_on_with(file: Path, monkeypatch: pytest.MonkeyPatch):

@@ -8,19 +8,23 @@ import json
 import re
 import shlex
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
-from supervision import machine
+from supervision import MPS, machine
 
 from benchmarks import records, runner
+from benchmarks.cases import SUITES
 from benchmarks.free_gpus import FreeGpus, on_free_gpus
 from benchmarks.records import read_calls
 from benchmarks.runner import exit_code, failure_of, in_turn, start, wait_until
+from gmijax.cli.compose import compose
 from gmijax.errors import ConfigError
+from gmijax.supervise.job_kinds import training_plan
 
 
 @pytest.fixture(autouse=True)
@@ -85,6 +89,25 @@ def test_free_gpus_are_given_back():
         assert all_of_them == (0, 1, 2)
 
 
+def test_who_needs_several_gpus_is_not_passed_by_who_needs_one():
+    free, order = FreeGpus(2), []
+
+    def take(count: int) -> None:
+        with free.taken(count):
+            order.append(count)
+
+    threads = [threading.Thread(target=take, args=(count,)) for count in (2, 1)]
+    with free.taken():
+        for number, thread in enumerate(threads, 1):
+            thread.start()
+            while len(free._waiting) < number:
+                time.sleep(0.001)
+        assert order == []  # One GPU is free, and it is not that thread's turn.
+    for thread in threads:
+        thread.join()
+    assert order == [2, 1]
+
+
 def test_turns_get_as_many_gpus_as_they_need_or_none():
     def run(turn: int, gpus: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
         if turn > 2:
@@ -139,7 +162,8 @@ class Commands:
         (place,) = (word for word in command if word.startswith(("run.dir=", "run.name=")))
         key, _, name = place.partition("=")
         folder = Path(name) if key == "run.dir" else given[0] / "runs" / name
-        self.made.append([word for word in command if word != place][1:])
+        scratch = (place, f"search.store={folder.parent}")
+        self.made.append([word for word in command if word not in scratch][1:])
         if len(self.made) - 1 in self.failing:
             raise KeyboardInterrupt
         job = folder / "000"
@@ -153,11 +177,12 @@ class Commands:
             ("summary", {**SUMMARY, "step_per_s_inference": 2.0, "stages_ms": STAGES}),
             ("sweep", report),
             ("pack", report),
+            ("search", {"env": "ant", "best": {"num_envs": 64}, "wall_s": 5.0}),
         ):
             (folder / f"{name}.json").write_text(json.dumps(content))
         return 0
 
-    def failure_of(self, command: Sequence[str], folder: Path | None = None) -> None:
+    def failure_of(self, command: Sequence[str], folder: Path | None = None, *_: Any) -> None:
         self.run(command, folder)
 
 
@@ -205,6 +230,11 @@ BENCHMARKS: dict[str, tuple[list[str], str, list[list[str]]]] = {
             ]
             for count in (2, 1)
         ],
+    ),
+    "searches": (
+        ["--tasks", "ant", "--", "search.budget_s=60"],
+        "searches-cpu",
+        [["-m", "gmijax.search", "env=ant", "search.budget_s=60"]],
     ),
     "serving": (
         ["--tasks", "ant", "--simulators", "2", "--templates", "tdg"],
@@ -290,8 +320,8 @@ def test_only_what_has_not_succeeded_is_run_again(tmp_path: Path, monkeypatch: p
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
-        (["ant-1gpu", "--only", "none"], "--only 'none': no case of these suites has that in"),
-        (["ant-2gpu", "--gpus", "1"], "--gpus 1: every case of these suites needs more"),
+        (["reward", "--only", "none"], "--only 'none': no case of these suites has that in"),
+        (["async-channels", "--gpus", "1"], "--gpus 1: every case of these suites needs more"),
     ],
 )
 def test_a_suite_without_a_case_to_run_is_refused(
@@ -304,6 +334,26 @@ def test_a_suite_without_a_case_to_run_is_refused(
     monkeypatch.setattr(sys, "argv", ["run", "--out", str(tmp_path), *arguments])
     assert exit_code(importlib.import_module("benchmarks.run").main) == 2
     assert capsys.readouterr().err.startswith(error)
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_every_case_has_a_plan(suite: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("gmijax.partition.reduction.is_installed", lambda *_: True)
+    for case in SUITES[suite]:
+        gpus = f"plan.gpus=[{','.join(map(str, range(case.gpus)))}]"  # As `--gpus` has it.
+        for more in ((), (gpus,)):
+            config = compose(*(text.format(run=0) for text in case.overrides), *more)
+            plan = training_plan(config, machine(case.gpus, mps_control=MPS))
+            assert plan.layout.num_gpus == case.gpus
+
+
+def test_what_would_not_end_before_the_deadline_is_not_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    commands = Commands()
+    assert run_benchmark("run", tmp_path, monkeypatch, commands, "--deadline-s", "1") == 1
+    assert commands.made == []
+    assert capsys.readouterr().err == "1 of 1 runs failed or had no time: see --resume\n"
 
 
 class Taken(Exception):

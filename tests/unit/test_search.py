@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
-from benchmarks.records import RESULTS
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point, coarse, neighbours
 from gmijax.autotune.search import (
     OutOfBudget,
@@ -248,7 +248,7 @@ def test_an_implementation_that_is_clearly_slower_is_left_after_the_first_row(
 
 def test_points_of_an_h200_give_the_same_answer_with_fewer_profiles():
     """What was measured there when no implementation was left out."""
-    rows = json.loads((RESULTS / "search-ant-jax-warp-h200.json").read_text())
+    rows = json.loads(Path(__file__).with_name("search_points_of_an_h200.json").read_text())
     known = {
         Point(row["gmis_per_gpu"], row["num_envs"], row["impl"]): row for row in rows["points"]
     }

@@ -118,6 +118,7 @@ def test_auto_refuses_other_critics(tmp_path: Path, key: str):
 def test_a_saved_replay_has_to_fit_only_where_it_is_gone_on_with(tmp_path: Path):
     run = RunPaths(tmp_path / "run")
     line = ("env=ant", "algo=sac", "num_envs=1024", "physics.impl=jax", "algo.save_replay=true")
+    line += ("algo.replay_steps=1024", "algo.replay_precision=float32")
     write_json(run.config, to_dict(config := compose(*line)))
     hidden = config.algo.hidden_layer_sizes
     checkpoint = save_meta(run, CheckpointMeta("ant", "sac", 4096, 2, 1024, hidden, "jax"))

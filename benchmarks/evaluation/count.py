@@ -1,0 +1,125 @@
+"""Counts the figures of documents, and those of them that a reviewer believes.
+
+A figure is a marked one, or a cell with a digit in a column of numbers that are measured. It is
+believed if its file has commit and date, and it is of three runs or more. A cell says of how many
+it is (`n=3`, `5 of 20`); one that does not is of as many as every case of its files, at least one;
+a ratio, of as many as the cells of its row. Files are those below a table, or the one that a row
+names. Not counted: predictions, and tables of words, which repeat figures of others.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from benchmarks.evaluation.figures import look_up_all
+from gmijax.errors import ConfigError
+
+LEAST = 3
+SETTINGS = frozenset(
+    (
+        *("environments", "GPUs", "steps", "million steps", "call", "cap, %", "SMs", "kinds"),
+        *(
+            "sweeps",
+            "seeds",
+            "profiles",
+            "return",
+            "mark",
+            "MIG",
+            "Isaac Gym, on an A100",
+            "model",
+        ),
+        *("at the end: million steps", "faults"),
+    )
+)
+"""Columns of numbers that were chosen, counted or predicted."""
+
+PREDICTIONS = frozenset(("node-scaling",))
+_RATIO = re.compile(r"over |ratio|of ideal|measured$|two GMIs")
+_OF = re.compile(r"n=(\d+)|\d+ of (\d+)")
+_REPEATS = re.compile(r"(\d+)(?: to \d+)? runs? of each case")
+
+
+class Count(NamedTuple):
+    """Figures.
+
+    Attributes:
+      all: of them.
+      believed: with commit, date and enough runs.
+    """
+
+    all: int = 0
+    believed: int = 0
+
+    def __add__(self, other: tuple[int, ...]) -> Count:
+        return Count(self.all + other[0], self.believed + other[1])
+
+    def __str__(self) -> str:
+        return f"figures: {self.all}, with commit, date and n>={LEAST}: {self.believed}"
+
+
+def of_figure(reference: str) -> Count:
+    """Of a marked figure; one whose file is gone is not believed."""
+    try:
+        call, values = look_up_all(reference)
+    except ConfigError:
+        return Count(1)
+    has_origin = call.commit and call.date
+    return Count(1, int(bool(has_origin and min(map(len, values)) >= LEAST)))
+
+
+def of_table(name: str, text: str) -> Count:
+    """Of a table as it stands in a document: one head or several, files below each."""
+    total = Count()
+    if name in PREDICTIONS:
+        return total
+    lines = text.splitlines()
+    rules = [at for at, line in enumerate(lines) if re.match(r"\| ---", line)]
+    for at, end in zip(rules, [*(at - 1 for at in rules[1:]), len(lines)], strict=False):
+        head, rule = _cells(lines[at - 1]), _cells(lines[at])
+        measured = [r == "---:" and not _is_setting(h) for h, r in zip(head, rule, strict=True)]
+        sources = [line for line in lines[at:end] if line.startswith("- [`")]
+        for line in lines[at + 1 : end]:
+            if line.startswith("|"):
+                total += _of_row(head, measured, _cells(line), sources)
+    return total
+
+
+def _is_setting(name: str) -> bool:
+    return name in SETTINGS or name.startswith("the paper's")
+
+
+def _of_row(
+    head: Sequence[str], measured: Sequence[bool], cells: Sequence[str], sources: Sequence[str]
+) -> Count:
+    mine = [one for one in sources if any(_names(one, cell) for cell in cells)] or sources
+    has_origin = bool(mine) and not any("unknown" in one for one in mine)
+    at_least = min((_least(_REPEATS, one) for one in mine), default=1)
+    own = max((_least(_OF, cell) for cell in cells if " of " in cell), default=0) or at_least
+    figures = [
+        (bool(_RATIO.match(name)), max(own, _least(_OF, cell)) if "n=" in cell else own, cell)
+        for name, is_measured, cell in zip(head, measured, cells, strict=True)
+        if is_measured and re.search(r"\d", cell)
+    ]
+    of_row = min((n for is_ratio, n, _ in figures if not is_ratio), default=at_least)
+    runs = [of_row if is_ratio and "n=" not in cell else n for is_ratio, n, cell in figures]
+    return Count(len(figures), sum(has_origin and n >= LEAST for n in runs))
+
+
+def _names(source: str, cell: str) -> bool:
+    return bool(re.fullmatch(r"`[\w.-]+`", cell)) and f"[`{cell[1:-1]}.json`]" in source
+
+
+def _least(pattern: re.Pattern[str], text: str) -> int:
+    """The smallest number that a pattern finds, 1 without any."""
+    return min(_numbers(pattern, text), default=1)
+
+
+def _numbers(pattern: re.Pattern[str], text: str) -> Iterator[int]:
+    for match in pattern.finditer(text):
+        yield int(next(filter(None, match.groups())))
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip().strip("|").split("|")]

@@ -1,0 +1,115 @@
+"""The tables of serving: GMIs that simulate and infer, in one process or several."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
+
+from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
+from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
+from benchmarks.paper_model import Task, serving_gain
+from benchmarks.records import calls_by_date
+
+Case: TypeAlias = Mapping[str, Any]
+
+TASKS = ("ant", "humanoid")
+GMIS = (2, 3, 4, 8)
+"""That share 8192 environments."""
+
+
+def _newest(is_wanted: Callable[[Case], bool]) -> Calls:
+    """The newest call with such a case."""
+    calls = calls_by_date("serving-*nvidia-*.json")
+    found = [one for one in calls if any(map(is_wanted, one[0].results["cases"]))]
+    return {"newest": found[-1]} if found else {}
+
+
+def _of_backends() -> Calls:
+    return _newest(lambda case: case["backend"] == "share" and "colocated" in case)
+
+
+def _of_templates() -> Calls:
+    return _newest(lambda case: "simulator_s" in case)
+
+
+def _cases(calls: Calls) -> list[Case]:
+    return [case for call, _ in calls.values() for case in call.results["cases"]]
+
+
+def _case(task: str, gmis: int, backend: str) -> Case | None:
+    """Of an old call that has several of this name, the last."""
+    name = f"{task} {gmis} x {8192 // gmis}, {backend}"
+    found = [case for case in _cases(_of_backends()) if case["name"] == name]
+    return found[-1] if found and "colocated" in found[-1] else None
+
+
+def serving_rate(task: str, gmis: int, backend: str = "mps") -> Figure | None:
+    """Steps/s of serving in GMIs that share 8192 environments."""
+    case = _case(task, gmis, backend)
+    runs = case["runs"]["tcg"] if case else ()
+    return figure([run["step_per_s_inference"] for run in runs])
+
+
+def mps_over_share(task: str, gmis: int) -> float | None:
+    """Steps/s under MPS over those of plain sharing."""
+    return over(serving_rate(task, gmis), serving_rate(task, gmis, "share"))
+
+
+def mps_over_one(task: str, gmis: int) -> float | None:
+    """Steps/s of GMIs under MPS over one process, of one call."""
+    return over(serving_rate(task, gmis), serving_rate(task, 1))
+
+
+def templates_gains() -> list[float]:
+    """Steps/s of one GMI for all tasks over one for each, of every case."""
+    cases = [case for case in _cases(_of_templates()) if "simulator_s" in case]
+    return [case["colocated"] / case["dedicated"] for case in cases]
+
+
+@table_of_calls(
+    "backends",
+    "task | MJX | GMIs x environments | `mps`, steps/s: | `share`, steps/s: | ratio: | "
+    "over one process: | MIG:",
+    _of_backends,
+)
+def backends(_: Calls) -> Rows:
+    """MPS against plain sharing."""
+    for task in TASKS:
+        for gmis in GMIS:
+            pair = [serving_rate(task, gmis, backend) for backend in ("mps", "share")]
+            if all(pair):
+                impl = (_case(task, gmis, "share") or {}).get("impl") or ""
+                rates = (shown(one, ",.0f") for one in pair)
+                gains = shown(over(*pair)), shown(mps_over_one(task, gmis))
+                size = f"{gmis} x {8192 // gmis:,}"
+                yield [f"`{task}`", impl, size, *rates, *gains, NOT_MEASURED]
+
+
+SERVING_HEAD = (
+    "GMIs that simulate | `tcg`, steps/s: | `tdg`, steps/s: | T_s, ms: | T_a, ms: | COM, ms: "
+    "| model: | measured:"
+)
+
+
+@table_of_calls("serving-templates", SERVING_HEAD, _of_templates)
+def serving_templates(calls: Calls) -> Rows:
+    """Simulator and agent in one GMI against apart, with the paper's model."""
+    return [serving_row(case) for case in _cases(calls) if "simulator_s" in case]
+
+
+def serving_row(case: Case) -> list[str]:
+    """A case of serving, of which one template may not have been measured."""
+    tcg, tdg = case.get("colocated"), case.get("dedicated")
+    times_s = [case.get(key) for key in ("simulator_s", "agent_s", "com_s")]
+    return [
+        *(case["name"], shown(tcg, ",.0f"), shown(tdg, ",.0f")),
+        *(shown(None if one is None else 1e3 * one) for one in times_s),
+        shown(predicted_gain(case) if "com_s" in case else None),
+        shown(tcg / tdg if tcg and tdg else None),
+    ]
+
+
+def predicted_gain(case: Case) -> float:
+    """Throughput of co-located over dedicated GMIs by equation 2, with the paper's R and alpha."""
+    simulator, agent = Task(case["simulator_s"], 10.0), Task(case["agent_s"], 1.0)
+    return serving_gain(simulator, agent, 0.2, case["com_s"])
