@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from gmijax.config import SacConfig, TrainConfig
+from gmijax.config import TrainConfig
 
 _MANY_ENVS: Final = 2048
 _MANY_STEPS: Final = 10_000_000
 """From both of these on settings are for a GPU: all that are shipped for robots."""
 
-_SMALL: Final = "num_envs=64 num_timesteps=1e5"
+_SMALL: Final = "num_envs=64", "num_timesteps=1e5"
 
 
 def large_on_cpu(config: TrainConfig, *, on_cpu: bool) -> tuple[str, ...]:
@@ -18,9 +18,8 @@ def large_on_cpu(config: TrainConfig, *, on_cpu: bool) -> tuple[str, ...]:
     num_envs, steps = config.num_envs, config.num_timesteps
     if not on_cpu or num_envs == "auto" or num_envs < _MANY_ENVS or steps < _MANY_STEPS:
         return ()
-    # Its updates cost by their batches, not by the number of environments.
-    batch = " algo.batch_size=256" if isinstance(config.algo, SacConfig) else ""
+    small = " ".join((*_SMALL, *config.algo.small_keys))
     return (
         f"warning: {num_envs:,} environments for {steps:,} steps are meant for a GPU, and can "
-        f"take hours or days on the CPU; for a small try add {_SMALL}{batch}",
+        f"take hours or days on the CPU; for a small try add {small}",
     )
