@@ -155,7 +155,9 @@ def outcome(folder: Path) -> dict[str, Any]:
             for line in lines
             if line.get("eval/return") is not None
         ],
-        "metrics": {k: v for k, v in lines[-1].items() if k.startswith("metric/")},
+        "metrics": {
+            k: v for k, v in lines[-1].items() if k.startswith("metric/") and v is not None
+        },
         "diverged_steps": sum(line["diverged_steps"] for line in lines),
         "medians": {name: median(lines, name) for name in names},
     }

@@ -44,6 +44,14 @@ def train(link: ChildLink) -> None:
     link.beat("done", iteration)
 
 
+def long_iteration(link: ChildLink) -> None:
+    """Looks for a request to stop only once an iteration has ended."""
+    link.beat("running", 1)
+    while (link.run.root / "hold_iteration").exists():
+        time.sleep(TICK_S)
+    train(link)
+
+
 def deaf(link: ChildLink) -> None:
     """Never looks at requests to stop, beats on."""
     while True:
@@ -179,7 +187,7 @@ MODES: dict[str, Callable[[ChildLink], None]] = {
     for mode in (
         *(clean, train, deaf, stubborn, busy, exit_3, raise_value_error, raise_config_error),
         *(lose_peer, wait_in_vain, die_late, die_soon, stall, silent, mps_client, linger),
-        *(exit_beside_stopped, mps_client_in_a_call),
+        *(exit_beside_stopped, mps_client_in_a_call, long_iteration),
     )
 }
 

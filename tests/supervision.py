@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.start_gmi import Launch
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.supervise.supervisor import Supervisor
 
 CHECKOUT = Path(errors.__file__).parents[1]
@@ -107,10 +109,13 @@ def cpu_supervisor(
     run: RunPaths,
     modes: Sequence[str],
     inherited_fds: Mapping[str, int] | None = None,
+    signals: StopSignals | None = None,
+    waits: bool = False,
     **changes: Any,
 ) -> Supervisor:
-    """Of a job on the cpu backend."""
+    """Of a job on the cpu backend; `waits`: after Ctrl-C, as training does."""
     here = machine(0)
     plan = planned(here, gmis_per_gpu=len(modes))
     backend = open_backend(plan, here, run)
-    return Supervisor(make_launch(run, modes, plan, **changes), backend, inherited_fds)
+    launch = replace(make_launch(run, modes, plan, **changes), waits_after_ctrl_c=waits)
+    return Supervisor(launch, backend, inherited_fds, signals=signals)

@@ -20,7 +20,8 @@ from gmijax.machine.snapshot import Machine
 from gmijax.partition.placement import most_gmis_of_a_node, on_fewer_nodes
 from gmijax.partition.planner import num_gmis_of
 from gmijax.supervise.backends.backend import Backend
-from gmijax.supervise.run_gmis import Launch, OnTick, StopSignals, taking_turns
+from gmijax.supervise.run_gmis import Launch, OnTick, taking_turns
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import WatchedGmi
 
@@ -108,10 +109,8 @@ class ClusterJob:
             return node.start(gmi, launch.run.gmi(gmi))
 
         backend = BackendOfNodes(launch, self._joined)
-        supervisor = Supervisor(launch, backend, start=start)
-        signals.forward_to(supervisor.request_stop)
         try:
-            supervisor.run(on_tick)
+            Supervisor(launch, backend, start=start, signals=signals).run(on_tick)
         finally:
             self._cluster.leave()
 

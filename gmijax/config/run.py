@@ -25,8 +25,8 @@ class Timeouts(KeyGroup):
         "a GMI with no progress for this long has failed, seconds", positive=True
     )
     stop_timeout_s: float = doc(
-        "time GMIs get to finish their iteration or unroll and save when the job is told to end, "
-        "seconds",
+        "time GMIs get to finish their iteration or unroll and save when a signal such as SIGTERM "
+        "tells the job to end, seconds; after Ctrl-C they get run.stall_timeout_s",
         positive=True,
     )
     grace_s: float = doc(

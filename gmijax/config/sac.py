@@ -24,6 +24,8 @@ class SacConfig(PolicyConfig):
         *PolicyConfig.fixed_keys,
         *("critic_hidden_layer_sizes", "num_atoms", "value_range"),
     )
+    # Updates cost by their batches, not by the number of environments.
+    small_keys = ("algo.batch_size=256",)
 
     # algo= sets it.
     name: Literal["sac"] = "sac"

@@ -12,7 +12,7 @@ from types import FrameType
 from typing import Final
 
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
-from gmijax.supervise.run_gmis import STOP_SIGNALS
+from gmijax.supervise.stop_signals import STOP_SIGNALS
 
 EXIT_OK: Final = 0
 EXIT_FAILED: Final = 1

@@ -21,6 +21,7 @@ from gmijax.config.schema import to_dict
 from gmijax.control.console import Show, announce, nearby, open_console, print_next
 from gmijax.control.decide import JobSpec, decide, with_task
 from gmijax.control.films import filmed, find_opengl
+from gmijax.control.large_on_cpu import large_on_cpu
 from gmijax.control.progress import ConsoleProgress
 from gmijax.control.reduced_plan import with_gpus_left, with_nodes_left
 from gmijax.control.restarts import Attempts
@@ -115,7 +116,12 @@ def _train(
             f"{plan.num_envs_per_gmi} environments per GMI, template {plan.template}, reduction "
             f"{plan.strategy}"
         )
-        announce(console, run, plan, what, (*decided.reasons, *replay_line(config, plan), *notes))
+        lines = (
+            *large_on_cpu(config, on_cpu=plan.backend == "cpu"),
+            *replay_line(config, plan),
+            *notes,
+        )
+        announce(console, run, plan, what, (*decided.reasons, *lines))
         job = _TrainingJob(decided, run, folder, console, cluster, opengl)
         try:
             job.run_to_the_end(start_point, started_s)
@@ -204,6 +210,7 @@ class _TrainingJob:
             run=self._run,
             kind=training_kind(config),
             timeouts=config.run,
+            waits_after_ctrl_c=True,
             on_warning=self._console.print,
         )
 

@@ -93,6 +93,7 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
             run=gmis,
             kind=PACKED,
             timeouts=config.run,
+            waits_after_ctrl_c=True,
             variables={MEMBERS_VARIABLE: roots},
             on_warning=console.print,
         )

@@ -12,6 +12,11 @@ from gmijax.supervise.watched_gmi import GmiStatus
 
 BEFORE_RUNNING: Final = ("starting", "waiting", "compiling")
 
+_STOPPING: Final = (
+    "stopping: finishing the iterations that have begun, then saving; a second Ctrl-C ends at "
+    "once, without saving"
+)
+
 _LONG_S: Final = 180.0
 """Compiling for longer than that is not usual."""
 
@@ -33,12 +38,14 @@ class Phases:
         self._is_noted = False
 
     def enter(self, gmis: Sequence[GmiStatus]) -> str | None:
-        """Takes in the states of the GMIs; how long it compiled, in words, if that has ended."""
+        """Takes in the states of the GMIs; what is to be said of a new phase, if anything."""
         before, phase = self.now, _phase_of(gmis)
         if phase == before:
             return None
         now_s = time.monotonic()
         took_s, self.now, self._began_s = now_s - self._began_s, phase, now_s
+        if phase == "stopping":
+            return _STOPPING
         if (before, phase) != ("compiling", "running"):
             return None
         if self._compile_time is not None and not self._is_noted:

@@ -71,8 +71,8 @@ class ConsoleProgress:
             self._evaluated = line.get("eval/return", self._evaluated)
         if self._line:
             self._left.note(self._line["env_steps"])
-        if (compiled := self._phases.enter(gmis)) is not None:
-            self._console.print(compiled, style="dim")
+        if (news := self._phases.enter(gmis)) is not None:
+            self._console.print(news, style="dim")
         if self._display.has_panel:
             return self._panel(gmis)
         self._print_now_and_then(gmis)
@@ -83,7 +83,7 @@ class ConsoleProgress:
         phase, is_due = self._phases.now, now_s - self._shown_s > _LINE_EVERY_S
         if phase == self._shown[0] and not is_due:
             return
-        if self._has_figures or self._work or phase != "running":
+        if self._has_figures or self._work or phase not in ("running", "stopping"):
             text = self._text() if self._has_figures else self._phases.text()
             states = f"  [{_states(gmis)}]" if len(gmis) > 1 else ""
             self._console.print(f"{text}{states}")
@@ -100,9 +100,7 @@ class ConsoleProgress:
         for gmi in gmis if len(gmis) > 1 else ():
             done_so_far = f", iteration {gmi.iteration}" if gmi.iteration else ""
             grid.add_row(Text(f"GMI {gmi.gmi}: {gmi.state}{done_so_far}", "dim"))
-        if self._phases.now == "stopping":
-            grid.add_row(Text("stopping: saving a checkpoint", "dim"))
-        elif self._has_figures and self._part() == 1:
+        if self._phases.now != "stopping" and self._has_figures and self._part() == 1:
             grid.add_row(Text("finishing: saving a checkpoint, measuring the rates", "dim"))
         return grid
 

@@ -129,4 +129,7 @@ def what_is_left(config: TrainConfig, run: RunPaths) -> str:
         return f"continue: gmijax train {job} run.dir={folder} run.resume=auto"
     if not read_metrics(run.metrics):
         return "there is no checkpoint"
-    return "there is no checkpoint: run.stop_timeout_s is the time that GMIs get to save one"
+    return (
+        "there is no checkpoint: run.stop_timeout_s is the time that GMIs get to save one, after "
+        "Ctrl-C run.stall_timeout_s"
+    )

@@ -262,6 +262,7 @@ def _run(
         run=run,
         kind=serving_kind(job.config),
         timeouts=job.config.run,
+        waits_after_ctrl_c=True,
         on_warning=console.print,
     )
     with recorded(run, partial(_what_is_left, job), record), progress:

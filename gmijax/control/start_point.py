@@ -16,10 +16,18 @@ from gmijax.runs.folder import (
     RunPaths,
     create_run,
     given_run,
+    read_json,
     replays_of,
     require_new_run,
 )
-from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpoint
+from gmijax.runs.history import read_metrics
+from gmijax.runs.names import nearby
+from gmijax.runs.resume import (
+    CheckpointMeta,
+    checkpoints_of,
+    choose_checkpoint,
+    newest_checkpoint,
+)
 from gmijax.runs.saved_config import (
     differences,
     require_known_keys,
@@ -59,6 +67,8 @@ def find_start_point(config: TrainConfig) -> StartPoint:
     """
     if config.run.resume == "auto":
         return _go_on_or_start(config)
+    if config.run.resume is None and (run := _untrained(config)) is not None:
+        return StartPoint(run, notes=(f"nothing was trained in {nearby(run.root)} before",))
     require_new_run(config.run.dir, config.run.name, "; run.resume=auto continues that run")
     if config.run.resume is None:
         return StartPoint()
@@ -70,6 +80,19 @@ def find_start_point(config: TrainConfig) -> StartPoint:
             "set num_timesteps above that"
         )
     return StartPoint(checkpoint=checkpoint, notes=notes)
+
+
+def _untrained(config: TrainConfig) -> RunPaths | None:
+    """The run folder, if a command has ended there before it trained: its input may be mended."""
+    folder = given_run(config.run.dir, config.run.name)
+    if folder is None or not os.path.isfile(RunPaths(folder).summary):
+        return None
+    run = RunPaths(folder.resolve())
+    summary = read_json(run.summary)
+    has_ended = "algo" in summary and summary.get("status") in ("failed", "interrupted")
+    # Not as the summary says, which may be of an attempt before one that was killed.
+    has_trained = checkpoints_of(run.root) or read_metrics(run.metrics)
+    return run if has_ended and not has_trained else None
 
 
 def _go_on_or_start(config: TrainConfig) -> StartPoint:

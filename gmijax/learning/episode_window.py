@@ -54,10 +54,12 @@ class EpisodeWindow:
         self._limit = limit_steps
         self._steps = self._began = self._count = 0.0
         self._ended: deque[EpisodeTotals] = deque()
+        self._names: tuple[str, ...] = ()
 
     def add(self, episodes: Any, steps: float = 0.0) -> None:
         """Takes in the `EpisodeSums` of `steps` environment steps, as numbers of the host."""
         self._steps += steps
+        self._names = _names_of(episodes)
         if not episodes.count:
             return
         self._ended.append(EpisodeTotals(self._steps, *episodes))
@@ -73,17 +75,18 @@ class EpisodeWindow:
     def means(self) -> dict[str, float | None]:
         """`return`, `episode_length`, `reward/<term>` and `metric/<name>` of the short window.
 
-        The first two are None, and the others missing, while no episode has ended.
+        None while no episode has ended.
         """
         count, first = 0.0, len(self._ended)
         while first and count < WINDOW_EPISODES:
             first -= 1
             count += self._ended[first].count
-        return _means(list(self._ended)[first:])
+        return _means(list(self._ended)[first:], self._names)
 
     def line(self) -> dict[str, float | None]:
         """Means of both windows, how many episodes the long one has, and if it is full."""
-        long = {f"window/{name}": mean for name, mean in _means(self._ended).items()}
+        means = _means(self._ended, self._names)
+        long = {f"window/{name}": mean for name, mean in means.items()}
         size = {"window/episodes": self._count, "window/full": int(self.standing().is_full)}
         return {**self.means(), **size, **long}
 
@@ -93,7 +96,7 @@ class EpisodeWindow:
         is_long = self._steps >= self._began + 2 * self._limit
         is_settled = bool(self._ended) and self._ended[0].at > self._began + self._limit
         is_full = self._count >= WINDOW_EPISODES and is_long and is_settled
-        return Standing(_means(self._ended)["return"], is_full)
+        return Standing(_means(self._ended, ())["return"], is_full)
 
     def state(self) -> dict[str, Any]:
         """All of it, for a JSON file of a checkpoint."""
@@ -113,10 +116,18 @@ class EpisodeWindow:
         self._count = sum(one.count for one in self._ended)
 
 
-def _means(ended: Sequence[EpisodeTotals] | deque[EpisodeTotals]) -> dict[str, float | None]:
+def _names_of(episodes: Any) -> tuple[str, ...]:
+    """Under which terms and metrics of `EpisodeSums` are logged."""
+    terms = (f"reward/{name}" for name in episodes.term_sums)
+    return (*terms, *(f"metric/{name}" for name in episodes.metric_sums))
+
+
+def _means(
+    ended: Sequence[EpisodeTotals] | deque[EpisodeTotals], names: Sequence[str]
+) -> dict[str, float | None]:
     count = sum(one.count for one in ended)
     if not count:
-        return {"return": None, "episode_length": None}
+        return dict.fromkeys(("return", "episode_length", *names))
     return {
         "return": sum(one.return_sum for one in ended) / count,
         "episode_length": sum(one.length_sum for one in ended) / count,

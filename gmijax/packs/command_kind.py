@@ -8,11 +8,11 @@ import shlex
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from gmijax.clock import running_s
 from gmijax.config.pack import PackConfig
@@ -158,6 +158,10 @@ class CommandKind:
             **given,
         }
 
+    def require_ranked(self, line: Mapping[str, Any]) -> None:
+        """See `Kind`."""
+        del line  # A command may print it for the first time at its end.
+
     def why_hung(self, running: Running[CommandJob]) -> str | None:
         """See `Kind`."""
         (job,) = running.jobs
@@ -230,9 +234,9 @@ class CommandKind:
         del job
         return self._settings.max_restarts
 
-    def stop_s(self, job: CommandJob) -> float:
+    def stop_s(self, job: CommandJob, *, is_urgent: bool) -> float:
         """See `Kind`."""
-        del job
+        del job, is_urgent  # Whether a command hangs is not known.
         return self._settings.stop_timeout_s
 
     def ended(self, job: CommandJob, run: RunPaths) -> None:

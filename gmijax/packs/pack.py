@@ -27,7 +27,7 @@ from gmijax.packs.progress import own_patterns
 from gmijax.packs.slot_limiter import MOST_CLIENTS, SlotLimiter
 from gmijax.packs.template import require_names
 from gmijax.runs.folder import RUNS, RunPaths, given_run, read_json
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.jobs_per_gpu import CORES_OF_A_JOB
 from gmijax.sweeps.kind import Kind, Limiter
 from gmijax.sweeps.nodes import Host
@@ -150,10 +150,9 @@ class PackWork(Work[CommandJob]):
             "one for each core",
         )
 
-    def hint(self, report: Mapping[str, Any]) -> str:
+    @property
+    def unranked(self) -> str:
         """See `Work`."""
-        if report["ranking"] or all(job["state"] == "failed" for job in report["jobs"]):
-            return ""
         return "no reward was found in the output: pack.metric or pack.tag says where it is"
 
     def state_of(self, run: RunPaths, job: CommandJob) -> State:

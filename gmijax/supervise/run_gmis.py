@@ -8,13 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import signal
-import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
-from types import FrameType
-from typing import Final
 
 from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.errors import BackendUnavailable, ConfigError, FolderLost, GmijaxError, JobInterrupted
@@ -26,13 +21,9 @@ from gmijax.supervise.backends import Backend, open_backend
 from gmijax.supervise.child import ENV_EXCHANGE_FD
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.start_gmi import Launch, program_cache
+from gmijax.supervise.stop_signals import StopSignals, stop_signals
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import GmiStatus
-
-STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
-"""What asks a job to save and end: Ctrl-C, batch systems, a terminal that is closed."""
-
-_AGAIN_S = 1.0
 
 OnTick = Callable[[tuple[GmiStatus, ...]], None]
 
@@ -60,11 +51,8 @@ def run_gmis(
         inherited = shared_blocks(held, launch.kind, plan)
         launch, backend = _enter_backend(held, launch)
 
-        supervisor = Supervisor(launch, backend, inherited)
-        if signals is not None:
-            signals.forward_to(supervisor.request_stop)
         try:
-            supervisor.run(on_tick)
+            Supervisor(launch, backend, inherited, signals=signals).run(on_tick)
         finally:
             drop_unreadable(launch.run, plan.layout.gmis)
 
@@ -149,59 +137,3 @@ def taking_turns(launch: Launch, error: BackendUnavailable) -> Launch:
     )
     write_json(launch.run.plan, plan.to_dict())
     return dataclasses.replace(launch, plan=plan)
-
-
-class StopSignals:
-    """Signals that ask for an end: the first one, and the same one again a second later or more.
-
-    A program such as `timeout` sends its signal twice at once, and a batch system sends others
-    before the last: that is no impatience.
-
-    Attributes:
-      requests: how many have come that count.
-    """
-
-    def __init__(self) -> None:
-        self.requests = 0
-        self._last_s: dict[int, float] = {}
-        self._forward: Callable[[], None] | None = None
-
-    @property
-    def have_come(self) -> bool:
-        """Whether an end was asked for."""
-        return self.requests > 0
-
-    def handle(self, number: int, _: FrameType | None = None) -> None:
-        """The signal handler."""
-        now_s = time.monotonic()
-        is_again = now_s - self._last_s.get(number, now_s) >= _AGAIN_S
-        if is_again or not self._last_s:
-            self.requests += 1
-            if self._forward is not None:
-                self._forward()
-        self._last_s[number] = now_s
-
-    def forward_to(self, request_stop: Callable[[], None]) -> None:
-        """Forwards requests, also those that have come before."""
-        self._forward = request_stop
-        for _ in range(self.requests):
-            request_stop()
-
-
-@contextmanager
-def stop_signals() -> Iterator[StopSignals]:
-    """Hears `STOP_SIGNALS` in place of whatever they did."""
-    signals = StopSignals()
-    # Python delivers signals to the main thread only; elsewhere they are the caller's business.
-    is_main = threading.current_thread() is threading.main_thread()
-    # What was ignored when the job was started, by nohup for one, stays ignored.
-    previous = {
-        number: signal.signal(number, signals.handle)
-        for number in STOP_SIGNALS
-        if is_main and signal.getsignal(number) is not signal.SIG_IGN
-    }
-    try:
-        yield signals
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

@@ -32,6 +32,9 @@ class Launch:
       timeouts: time limits.
       stops_gracefully: the first signal of `STOP_SIGNALS` asks the GMIs to finish by themselves;
         otherwise signals do what Python does with them.
+      waits_after_ctrl_c: a first Ctrl-C lets the GMIs finish as long as none of them has stalled
+        (`timeouts.stall_timeout_s`), other signals for `timeouts.stop_timeout_s`; otherwise all
+        signals do the latter.
       variables: more environment variables of every GMI.
       on_warning: called with a sentence when the job runs otherwise than planned.
       is_enough: true once the job has what it needs: the GMIs then finish as after a first signal;
@@ -44,6 +47,7 @@ class Launch:
     kind: JobKind
     timeouts: Timeouts
     stops_gracefully: bool = True
+    waits_after_ctrl_c: bool = False
     variables: Mapping[str, str] = field(default_factory=dict)
     on_warning: Callable[[str], None] = lambda _: None
     is_enough: Callable[[tuple[GmiStatus, ...]], bool] | None = None

@@ -22,6 +22,7 @@ from gmijax.supervise.failures import (
     is_consequence,
 )
 from gmijax.supervise.start_gmi import Launch, StartGmi, start_gmi
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.supervise.watched_gmi import GmiStatus, WatchedGmi
 
 _POLL_S = 0.05
@@ -40,6 +41,8 @@ class Supervisor:
       inherited_fds: open files that every GMI inherits, by the environment variable that will
         hold the number of the descriptor.
       start: starts a GMI; None: on this machine.
+      signals: looked at for a request to end: the first lets the GMIs finish their iteration and
+        save; the second ends them. None: nobody asks.
     """
 
     def __init__(
@@ -48,22 +51,17 @@ class Supervisor:
         backend: Backend,
         inherited_fds: Mapping[str, int] | None = None,
         start: StartGmi | None = None,
+        signals: StopSignals | None = None,
     ) -> None:
         self._launch = launch
         self._backend = backend
         self._start_gmi = start or partial(start_gmi, launch, backend, inherited_fds or {})
         self._started: dict[int, WatchedGmi] = {}
         self._all_ready_s: float | None = None
-        self._stop_requests = 0
+        self._signals = signals or StopSignals()
         self._is_enough = launch.is_enough
+        self._is_stopping = False
         self._stop_deadline_s: float | None = None
-
-    def request_stop(self) -> None:
-        """Asks for an end; may be called from a signal handler.
-
-        The first request lets the GMIs finish their iteration and save; the second ends them.
-        """
-        self._stop_requests += 1
 
     def ask_to_finish(self) -> None:
         """Lets the GMIs finish as a first request does; the job then ends well."""
@@ -78,7 +76,7 @@ class Supervisor:
         if gmi not in self._started:
             return GmiStatus(gmi, "starting", 0, None, None)
         status = self._started[gmi].status()
-        is_stopping = self._stop_deadline_s is not None and status.state == "running"
+        is_stopping = self._is_stopping and status.state == "running"
         return status._replace(state="stopping") if is_stopping else status
 
     def run(self, on_tick: Callable[[tuple[GmiStatus, ...]], None] | None = None) -> None:
@@ -112,7 +110,7 @@ class Supervisor:
                     error.is_final = True  # Nothing may be started beside them.
             raise
         self._end_all()
-        if self._stop_requests:
+        if self._signals.have_come:
             raise JobInterrupted("stopped on request; all processes have finished their work")
 
     def _alive(self) -> list[WatchedGmi]:
@@ -165,17 +163,24 @@ class Supervisor:
         if self._is_enough is not None and self._is_enough(self.status()):
             self._is_enough = None
             self.ask_to_finish()
-        if not self._stop_requests:
+        if not self._signals.have_come:
             return
-        if self._stop_requests > 1:
+        if self._signals.requests > 1:
             raise JobInterrupted("stopped at once on a second request; the last work is not saved")
         if not all(p.is_ready for p in self._started.values()):
             raise JobInterrupted("stopped before training began")
+        if not self._is_stopping:
+            self._is_stopping = True
+            self.ask_to_finish()
+        self._require_in_time()
+
+    def _require_in_time(self) -> None:
+        """After Ctrl-C a person waits, and can end it: until then GMIs may go on if they do."""
+        if self._launch.waits_after_ctrl_c and not self._signals.are_urgent:
+            return  # `_check_progress` ends those that hang.
         now_s = running_s()
         if self._stop_deadline_s is None:
             self._stop_deadline_s = now_s + self._launch.timeouts.stop_timeout_s
-            for process in self._alive():
-                process.ask_to_stop()
         elif now_s > self._stop_deadline_s:
             late = [process.gmi for process in self._alive()]
             raise JobInterrupted(

@@ -8,7 +8,7 @@ import subprocess
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from gmijax.clock import running_s
 from gmijax.errors import GmijaxError
@@ -16,6 +16,9 @@ from gmijax.machine.processes import GuardPipe, members_of
 from gmijax.runs.folder import write_json
 from gmijax.runs.held import try_lock
 from gmijax.supervise.failures import last_line
+
+INTERRUPT_BYTE: Final = b"i"
+"""Comes by the lifeline of a controller in place of Ctrl-C."""
 
 _STAY_S = 15.0
 """Longest wait for the rest of a process group whose leader has ended."""
@@ -44,7 +47,7 @@ class Process(NamedTuple):
       cwd: its working folder; None: that of this process.
       input_file: path and JSON content, written before the start.
       has_lifeline: whether its last argument is to be the number of a pipe that ends with this
-        process.
+        process, and may bring an `INTERRUPT_BYTE` before.
       is_client: whether the process itself uses its GPU, and starts nothing that has a share.
       memory_fraction: part of the GPU's memory that it may have then; None: not limited.
       stop_signal: asks it to save and end.
@@ -132,9 +135,16 @@ class Child:
         with suppress(ProcessLookupError):
             if not self._is_client:
                 self._process.send_signal(self._stop_signal)
-            else:
+            elif not self._is_asked:  # A second signal could end it before it has saved.
                 self._is_asked = True
                 os.killpg(self.pid, self._stop_signal)
+
+    def interrupt(self) -> None:
+        """Asks it as Ctrl-C does: a controller then lets its GMIs take longer."""
+        if self._is_client:
+            self.ask_to_stop()
+            return
+        self._pipe.write(INTERRUPT_BYTE)  # No signal: it may have been told to ignore that one.
 
     def kill(self) -> None:
         """Ends it now, and its process group; GMIs end with their controller."""

@@ -21,7 +21,7 @@ from gmijax.supervise.backends.backend import Backend
 from gmijax.sweeps.children import Child, ChildStatus, Process
 from gmijax.sweeps.slots import Slot
 
-Order = Literal["ask_to_stop", "kill", "close"]
+Order = Literal["ask_to_stop", "interrupt", "kill", "close"]
 
 
 class ChildStart(NamedTuple):

@@ -17,7 +17,7 @@ from gmijax.autotune.store import ProfileStore
 from gmijax.autotune.tuner import workload_of
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import doing, is_verbose
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.density import GAIN
 from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.nodes import Host

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 from gmijax.runs.folder import RunPaths
 from gmijax.sweeps.any_job import J
@@ -38,6 +38,14 @@ class Kind(Protocol[J]):
         """What runs them there."""
         ...
 
+    def require_ranked(self, line: Mapping[str, Any]) -> None:
+        """A job has written this line of metrics.
+
+        Raises:
+          ConfigError: jobs have not what they are to be compared by.
+        """
+        ...
+
     def why_hung(self, running: Running[J]) -> str | None:
         """Why a process is to be ended that does nothing; None: it does."""
         ...
@@ -50,8 +58,8 @@ class Kind(Protocol[J]):
         """How often it may be started again after a fault."""
         ...
 
-    def stop_s(self, job: J) -> float:
-        """Seconds that it may take to save and end."""
+    def stop_s(self, job: J, *, is_urgent: bool) -> float:
+        """Seconds that it may take to save and end; after Ctrl-C it is not urgent."""
         ...
 
     def ended(self, job: J, run: RunPaths) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from gmijax.config import TrainConfig
+from gmijax.config.schema import suggestion
 from gmijax.config.sweep import Ranking, SweepConfig
 from gmijax.errors import ConfigError
 from gmijax.runs.history import number_in
@@ -45,6 +46,25 @@ def find(line: Mapping[str, Any], objective: str) -> ObjectiveValue | None:
         return None
     # Of a run of an older version, whose lines do not say over what they are means.
     return ObjectiveValue(number, is_full=not objective.startswith(_OF_EPISODES))
+
+
+def require_logged(line: Mapping[str, Any], objective: str) -> None:
+    """Refuses an objective that is not among the keys of a line of metrics.
+
+    All lines of a run have the same, but for those of evaluations.
+
+    Raises:
+      ConfigError: names those that there are.
+    """
+    if objective in line or (objective.startswith(_EVALUATIONS) and _EVALUATED not in line):
+        return
+    names = [name for name in line if not name.startswith("window/")]
+    group = objective.partition("/")[0]
+    of_group = [name for name in names if name.partition("/")[0] == group and "/" in name]
+    raise ConfigError(
+        f"sweep.objective={objective}: not in the metrics of these jobs"
+        f"{suggestion(objective, of_group or names)}"
+    )
 
 
 def value_of(curve: Sequence[tuple[int, float]], ranking: Ranking) -> float:

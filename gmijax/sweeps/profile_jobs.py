@@ -13,7 +13,7 @@ from gmijax.autotune.grid import Measured, NotRunnable
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.result import TrainResult
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.curve_window import CurveWindow
 from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.nodes import Host
@@ -42,7 +42,10 @@ def profile_jobs(
     gpus = settings.gpus if isinstance(settings.gpus, tuple) else None
     needed = job.num_gpus
     settings = dataclasses.replace(
-        settings, jobs_per_gpu=count, gpus=gpus[:needed] if gpus else needed
+        settings,
+        jobs_per_gpu=count,
+        gpus=gpus[:needed] if gpus else needed,
+        objective="return",  # Only their speed is compared.
     )
     limit_s = job.config.search.profile_limit_s
     with tempfile.TemporaryDirectory(prefix="gmijax-", dir=bench.scratch) as folder:

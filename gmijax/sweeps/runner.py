@@ -17,7 +17,7 @@ from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RUNS, given_run, read_json, write_json
 from gmijax.runs.held import OpenFolder, locked
-from gmijax.supervise.run_gmis import StopSignals, stop_signals
+from gmijax.supervise.stop_signals import StopSignals, stop_signals
 from gmijax.sweeps.any_job import J
 from gmijax.sweeps.events import JobEvents
 from gmijax.sweeps.folder import errors_of_files, opened_folder
@@ -58,7 +58,8 @@ def run_work(work: Work[J], *, show: Show = False, events: TextIO | None = None)
       events: gets a JSON object a line for each event, see `JobEvents`.
 
     Raises:
-      ConfigError: bad input, before anything was started.
+      ConfigError: bad input, before anything was started; or jobs have not what they are to be
+        compared by, and have saved and ended.
       SweepFailed: a job failed; all others have run.
       JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came, and all jobs have saved and ended.
     """
@@ -101,10 +102,7 @@ def _run(
         if (wrong := report.end(status)) is not None:
             error.add_note(wrong)
         job_events.end(report.data)
-        if isinstance(error, JobInterrupted | SweepFailed):
-            error.add_note(
-                f"continue: the same command with run.dir={shlex.quote(nearby(paths.root))}"
-            )
+        _say_how_to_continue(error, jobs, paths)
         raise
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
@@ -114,6 +112,14 @@ def _run(
     if ranking := report.data["ranking"]:
         print_next(console, work.next_step(paths, ranking[0]))
     return SweepResult(paths.root, report.data)
+
+
+def _say_how_to_continue(error: BaseException, jobs: Sequence[J], paths: SweepPaths) -> None:
+    folder = shlex.quote(nearby(paths.root))
+    if isinstance(error, JobInterrupted | SweepFailed):
+        error.add_note(f"continue: the same command with run.dir={folder}")
+    elif isinstance(error, ConfigError) and any(job.progress.attempts for job in jobs):
+        error.add_note(f"continue: the command with that mended and run.dir={folder}")
 
 
 def _require_success(
@@ -155,9 +161,14 @@ def _run_jobs(
         slots = SlotPool(sites)
         limiter = work.limiter(slots, sites, hosts, console)
 
+        hinted: list[str] = []
+
         def tick() -> None:
             report.update()
-            view.update()
+            if not hinted and (hint := work.hint(report.data)):
+                hinted.append(hint)  # At the end it is said once more.
+                console.print(hint)
+            view.update(is_stopping=signals.have_come)
             job_events.update()
 
         Scheduler(

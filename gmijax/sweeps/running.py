@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, Protocol
 
@@ -54,6 +55,7 @@ class Running(Generic[J]):
       readers: of their metrics.
       started_s: when, by the clock of this process.
       kill_at_s: when it is ended by force, by the clock of this process; None: it may go on.
+      was_urgent: whether it was asked to end as soon as it can.
       is_pruned: whether it was asked to end because others are better.
       is_retracted: whether that was because fewer are to run at once.
       hang_reason: why it was killed as hung; None: it was not.
@@ -68,6 +70,7 @@ class Running(Generic[J]):
     readers: tuple[Reader, ...]
     started_s: float = field(default_factory=running_s)
     kill_at_s: float | None = None
+    was_urgent: bool = False
     is_pruned: bool = False
     is_retracted: bool = False
     hang_reason: str | None = None
@@ -83,10 +86,13 @@ class Running(Generic[J]):
         """How it is; None: that is not known."""
         return self.host.look(self.child_id)
 
-    def order_stop(self, limit_s: float) -> None:
-        """Asks it to save and end within so many seconds."""
-        self.kill_at_s = self.kill_at_s or running_s() + limit_s
-        self.host.order(self.child_id, "ask_to_stop")
+    def order_stop(self, limit_s: float, *, is_urgent: bool) -> None:
+        """Asks it to save and end within so many seconds; once, and once more if it is urgent."""
+        if self.was_urgent or (self.is_asked and not is_urgent):
+            return  # A second time would end it without saving.
+        self.kill_at_s = min(self.kill_at_s or math.inf, running_s() + limit_s)
+        self.was_urgent = is_urgent
+        self.host.order(self.child_id, "ask_to_stop" if is_urgent else "interrupt")
 
     def kill(self) -> None:
         """Ends it; once."""

@@ -13,7 +13,7 @@ from gmijax.config.sweep import Ranking
 from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.folder import add_event
 from gmijax.runs.held import is_locked
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.any_job import J
 from gmijax.sweeps.children import ChildStatus
 from gmijax.sweeps.host import ChildStart
@@ -80,6 +80,7 @@ class Scheduler(Generic[J]):
 
         Raises:
           JobInterrupted: a signal came; all jobs have saved and ended.
+          ConfigError: jobs have not what they are to be compared by; all have saved and ended.
           NodeLost: no machine is left.
           GmijaxError, OSError: a job cannot be started, or the study not be written; all jobs have
             saved and ended.
@@ -166,6 +167,8 @@ class Scheduler(Generic[J]):
             is_over = running.is_over()
             for job, reader in zip(running.jobs, running.readers, strict=True):
                 for line in reader.new():
+                    if not running.is_asked:
+                        self._kind.require_ranked(line)
                     job.progress.report(line, self._ranking)
                     self._end_compile_wait(running)
             if running_s() > running.started_s + _FIRST_REPORT_S:
@@ -188,8 +191,9 @@ class Scheduler(Generic[J]):
                 running.is_retracted = True
                 self._order_stop(running)
 
-    def _order_stop(self, running: Running[J]) -> None:
-        running.order_stop(max(map(self._kind.stop_s, running.jobs)))
+    def _order_stop(self, running: Running[J], *, is_urgent: bool = True) -> None:
+        limit_s = max(self._kind.stop_s(job, is_urgent=is_urgent) for job in running.jobs)
+        running.order_stop(limit_s, is_urgent=is_urgent)
 
     def _finish(self, running: Running[J]) -> None:
         del self._running[running.jobs[0].number]
@@ -279,11 +283,11 @@ class Scheduler(Generic[J]):
 
     def _stop(self, signals: StopSignals) -> None:
         """Asks all jobs to save and end; the same signal again ends them at once."""
-        for running in self._running.values():
-            self._order_stop(running)
-        jobs = [job for running in self._running.values() for job in running.jobs]
-        deadline_s = running_s() + max(map(self._kind.stop_s, jobs), default=0.0)
-        while self._running and running_s() < deadline_s and signals.requests < 2:
+        while signals.requests < 2 and not all(one.kill_sent for one in self._running.values()):
+            # Ctrl-C may be followed by a signal that is in a hurry.
+            is_urgent = signals.are_urgent or not signals.have_come
+            for running in self._running.values():
+                self._order_stop(running, is_urgent=is_urgent)
             self._look()
             self._on_tick()
             time.sleep(_TICK_S)

@@ -15,9 +15,10 @@ from gmijax.config.schema import from_dict, to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import Show, nearby
 from gmijax.control.decide import with_task
+from gmijax.control.large_on_cpu import large_on_cpu
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.jobs import Job, jobs_of, require_placeable, state_of
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.kind import Kind
@@ -100,6 +101,11 @@ class SweepWork(Work[Job]):
         del sites
         return TrainingKind(self.ranking, paths)
 
+    @property
+    def unranked(self) -> str:
+        """See `Work`."""
+        return f"no job that is complete has had sweep.objective={self.ranking.objective}"
+
     def state_of(self, run: RunPaths, job: Job) -> State:
         """See `Work`."""
         return state_of(run, job.config)
@@ -114,9 +120,12 @@ class SweepWork(Work[Job]):
 
     def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """See `Work`."""
-        del sites
         is_left = any(job.progress.state != "completed" for job in self.jobs)
-        warnings = why_not_comparable(self.configs, self.ranking), _COMPILES if is_left else None
+        warnings = [why_not_comparable(self.configs, self.ranking)]
+        if is_left:
+            on_cpu = {site.plan.backend for site in sites} == {"cpu"}
+            large = (line for one in self.configs for line in large_on_cpu(one, on_cpu=on_cpu))
+            warnings += [next(large, None), _COMPILES]
         return tuple(filter(None, warnings))
 
 

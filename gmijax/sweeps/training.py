@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Final
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Final
 
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
@@ -16,6 +17,7 @@ from gmijax.sweeps.children import ChildStatus, Process
 from gmijax.sweeps.hparams import write_hparams
 from gmijax.sweeps.jobs import Job, placed
 from gmijax.sweeps.kind import JobStart
+from gmijax.sweeps.objective import require_logged
 from gmijax.sweeps.packs import PackPlanner, own_end
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.running import JobOutcome, Running
@@ -67,6 +69,10 @@ class TrainingKind:
             reader.new()  # Those are an earlier attempt's.
         return JobStart(process, readers)
 
+    def require_ranked(self, line: Mapping[str, Any]) -> None:
+        """See `Kind`."""
+        require_logged(line, self._settings.objective)
+
     def why_hung(self, running: Running[Job]) -> str | None:
         """See `Kind`; a controller sees for itself whether its GMIs hang."""
         del running
@@ -107,9 +113,11 @@ class TrainingKind:
         """See `Kind`."""
         return job.config.run.max_restarts
 
-    def stop_s(self, job: Job) -> float:
+    def stop_s(self, job: Job, *, is_urgent: bool) -> float:
         """See `Kind`."""
         run = job.config.run
+        if not is_urgent:
+            return math.inf  # Its controller sees whether a GMI hangs.
         return run.stop_timeout_s + run.grace_s + _KILL_AFTER_S
 
     def ended(self, job: Job, run: RunPaths) -> None:

@@ -21,6 +21,9 @@ _HEADINGS = (
     *("job", "overrides", "GPU and slot", "progress", "steps/s", "{}", "ranked by", "ETA"),
     "state",
 )
+_STOPPING = (
+    "stopping: running jobs save and end; a second Ctrl-C ends them at once, without saving"
+)
 _MOST_ROWS = 30
 _BAR_WIDTH = 6
 _ORDER = ("running", "failed", "interrupted", "waiting", "pruned", "completed")
@@ -40,6 +43,7 @@ class SweepView:
         self._states: dict[int, tuple[str, int]] = {}
         self._left: defaultdict[int, TimeLeft] = defaultdict(TimeLeft)
         self._display = LiveDisplay(console)
+        self._is_stopping = False
 
     def __enter__(self) -> Self:
         self._display.__enter__()
@@ -49,8 +53,11 @@ class SweepView:
         self._display.__exit__(*exc)
         self._display.show(self._print_changes)
 
-    def update(self) -> None:
-        """Called about ten times a second."""
+    def update(self, *, is_stopping: bool = False) -> None:
+        """Called about ten times a second; `is_stopping`: a signal has asked for an end."""
+        if is_stopping and not self._is_stopping:
+            self._is_stopping = True
+            self._console.print(_STOPPING)
         self._display.show(self._show)
 
     def line(self) -> str:

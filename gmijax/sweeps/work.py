@@ -13,7 +13,7 @@ from rich.console import Console
 from gmijax.config import ClusterConfig
 from gmijax.config.sweep import JobsConfig, Ranking
 from gmijax.runs.folder import RunPaths
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.any_job import J
 from gmijax.sweeps.kind import Kind, Limiter
 from gmijax.sweeps.nodes import Host
@@ -118,6 +118,11 @@ class Work(ABC, Generic[J]):
         del slots, sites, hosts, console
         return None
 
+    @property
+    @abstractmethod
+    def unranked(self) -> str:
+        """Why there is no ranking where jobs are complete, for the user."""
+
     @abstractmethod
     def state_of(self, run: RunPaths, job: J) -> State:
         """Whether an earlier command has completed a job."""
@@ -135,9 +140,9 @@ class Work(ABC, Generic[J]):
         return ()
 
     def hint(self, report: Mapping[str, Any]) -> str:
-        """A line after the tables of a report, or nothing."""
-        del report
-        return ""
+        """A line once jobs are complete of which none can be ranked; else nothing."""
+        is_any_complete = any(job["state"] == "completed" for job in report["jobs"])
+        return self.unranked if is_any_complete and not report["ranking"] else ""
 
     def grid_identity(self) -> dict[str, Any]:
         """What must be the same of the jobs' values."""

@@ -2,7 +2,8 @@
 
 It trains one job, or several that are one program.
 
-It ends, with a checkpoint, when the pipe FD ends: the sweep is gone then.
+It ends, with a checkpoint, when the pipe FD ends: the sweep is gone then. Any byte that comes
+before is Ctrl-C.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from gmijax.runs.folder import read_json
 
 def main(order: Path, lifeline_fd: int) -> int:
     """Trains as the file `order` says; returns the exit code of `gmijax.train`."""
+    # A shell may have had the sweep ignore it; it comes from nobody but the sweep here.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     threading.Thread(target=_end_with_the_sweep, args=(lifeline_fd,), daemon=True).start()
     data = read_json(order)
     if data["cpus"]:
@@ -34,7 +37,8 @@ def main(order: Path, lifeline_fd: int) -> int:
 
 
 def _end_with_the_sweep(fd: int) -> None:
-    os.read(fd, 1)
+    while os.read(fd, 1):
+        os.kill(os.getpid(), signal.SIGINT)
     os.kill(os.getpid(), signal.SIGTERM)
 
 

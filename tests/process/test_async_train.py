@@ -180,7 +180,7 @@ def test_an_interrupt_saves_the_whole_job(tmp_path: Path) -> None:
     run = cwd / "run"
     job = start(
         *(*SMALL, FOREVER, "run.dir=run", "plan.serving_gpus=[0,1]", "plan.training_gpus=[0,1]"),
-        *("reduce.strategy=har", "channel.design=uni"),
+        *("reduce.strategy=har", "channel.design=uni", "run.stop_timeout_s=1e-6"),
         cwd=cwd,
     )
     wait_for_updates(job, run, range(4))

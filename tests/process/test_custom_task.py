@@ -70,6 +70,22 @@ def test_a_task_of_ones_own_trains_in_two_gmis_and_resumes(tmp_path: Path):
     assert "in reward/near" in done.stderr
 
 
+def test_after_a_mistake_in_the_file_the_same_command_trains(tmp_path: Path):
+    file = tmp_path / "point.py"
+    file.write_text(TASK.replace("jnp.abs", "jnp.abz"))
+    command = ("env=point.py:make", *SMALL, "num_timesteps=64", "run.dir=mine")
+    refused = train(*command, cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "has no attribute 'abz'" in refused.stderr
+    file.write_text(TASK)
+    done = train(*command, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "nothing was trained in mine before" in done.stdout
+    assert not list((tmp_path / "mine").rglob("error.json"))
+    # What was trained is not replaced.
+    assert "exists already" in train(*command, cwd=tmp_path).stderr
+
+
 def test_files_may_have_the_names_of_packages(tmp_path: Path):
     """Beside the task and in the working directory; the neighbour is the one of the task."""
     for name in ("random", "queue", "statistics", "optax", "flax/__init__", "gmijax/__init__"):

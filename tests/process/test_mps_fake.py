@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import time
@@ -29,6 +30,7 @@ from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.run_gmis import Launch, run_gmis, taking_turns
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import GmiStatus
 
@@ -62,13 +64,14 @@ def train_and_stop(
     """Runs a job until all GMIs iterate, then stops it; returns its daemons' directories."""
     with open_backend(plan, here, run) as backend:
         directories = [Path(backend.environment(gmi)[PIPE_VARIABLE]) for gmi in plan.layout.gmis]
-        supervisor = Supervisor(make_launch(run, modes, plan), backend)
+        signals = StopSignals()
+        supervisor = Supervisor(make_launch(run, modes, plan), backend, signals=signals)
         stopped: list[bool] = []
 
         def stop_once(status: tuple[GmiStatus, ...]) -> None:
             if not stopped and all(s.state == "running" for s in status):
                 look(directories)
-                supervisor.request_stop()
+                signals.handle(signal.SIGTERM)
                 stopped.append(True)
 
         with pytest.raises(JobInterrupted, match="all processes have finished their work"):

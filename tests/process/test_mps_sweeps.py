@@ -17,7 +17,7 @@ from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl
 from gmijax.machine.snapshot import DAEMONS_VARIABLE, detect_machine
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends import open_backend
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.host import LocalHost, variables_of
 from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.paths import SweepPaths

@@ -73,7 +73,7 @@ def test_after_a_kill_and_a_stop_all_jobs_of_a_program_go_on(tmp_path: Path) -> 
     command = (*SWEEP, "seed=0,1", "algo.learning_rate=1e30,3e-4")
     command = (*command, f"num_timesteps={ITERATIONS * STEPS}")
     command = (*command, "algo.learning_rate_schedule=fixed", "run.checkpoint_every=20")
-    command = (*command, "run.max_restarts=2")
+    command = (*command, "run.max_restarts=2", "run.stop_timeout_s=1e-6")
     runs = [tmp_path / "all" / name for name in ("001", "003")]
     sweep = start(*command, cwd=tmp_path, command="sweep")
 
@@ -92,6 +92,7 @@ def test_after_a_kill_and_a_stop_all_jobs_of_a_program_go_on(tmp_path: Path) -> 
     sweep.send_signal(signal.SIGINT)
     assert sweep.wait(timeout=120) == 130
     assert states(tmp_path) == ["failed", "interrupted"] * 2
+    assert (tmp_path / "stdout.txt").read_text().count("stopping: running jobs save and end") == 1
 
     done = train(*command, cwd=tmp_path, command="sweep")
     assert done.returncode == 1

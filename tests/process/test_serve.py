@@ -154,6 +154,7 @@ def test_after_a_kill_the_same_command_goes_on(home: Path, request: pytest.Fixtu
 
 def test_an_interrupted_job_leaves_whole_shards(home: Path, request: pytest.FixtureRequest):
     job = (*RANDOM, "plan.gmis_per_gpu=2", "plan.template=tdg", "num_timesteps=1e9")
+    job = (*job, "run.stop_timeout_s=1e-6")  # That is the time after other signals.
     process = start(*job, "run.name=int", "output.dir=int", cwd=home, command="serve")
     request.addfinalizer(process.kill)
     wait_until(lambda: finished(home / "int") >= 2, 240, "two shards")

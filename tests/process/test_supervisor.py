@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -23,6 +24,7 @@ from gmijax.partition.shares import split_cores
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.supervise.backends import Backend
 from gmijax.supervise.child import ENV_EXCHANGE_FD
+from gmijax.supervise.stop_signals import STOP_SIGNALS, StopSignals
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import GmiStatus
 
@@ -228,27 +230,85 @@ def test_missing_program_half_way_ends_those_that_run(
         run_job(cpu_supervisor(run, ["deaf", "deaf"]))
 
 
-def test_a_stop_request_lets_gmis_save_and_names_those_that_are_late(run: RunPaths):
-    stop = once_all_iterate(lambda supervisor, _: supervisor.request_stop())
-    supervisor = cpu_supervisor(run, ["train", "deaf"], stop=3.0)
+@pytest.mark.parametrize(
+    ("number", "waits"),
+    [
+        *((number, True) for number in STOP_SIGNALS if number != signal.SIGINT),
+        (signal.SIGINT, False),  # As of roles: what they do has no iterations.
+    ],
+)
+def test_a_signal_lets_gmis_save_and_names_those_that_are_late(
+    run: RunPaths, number: int, waits: bool
+):
+    signals = StopSignals()
+    supervisor = cpu_supervisor(run, ["train", "deaf"], signals=signals, waits=waits, stop=3.0)
     with pytest.raises(JobInterrupted, match=r"GMIs \[1\] did not finish within 3 s"):
-        run_job(supervisor, stop)
+        run_job(supervisor, once_all_iterate(lambda *_: signals.handle(number)))
     assert (run.gmi(0).root / "saved").exists()
     assert supervisor.status()[1].state == "stopping"
 
 
-def test_second_stop_request_ends_at_once(run: RunPaths):
-    def stop_again(supervisor: Supervisor, ticks: Ticks) -> None:
+def test_after_ctrl_c_an_iteration_may_take_longer(run: RunPaths):
+    signals, hold, deadline_s = StopSignals(), run.root / "hold_iteration", []
+    hold.touch()
+
+    def act(_: Supervisor, ticks: Ticks) -> None:
+        if not all_iterate(ticks):
+            return
+        if not deadline_s:
+            signals.handle(signal.SIGINT)
+            deadline_s.append(time.monotonic() + 1.0)
+        if time.monotonic() > deadline_s[0]:  # Much later than after a SIGTERM.
+            hold.unlink(missing_ok=True)
+
+    modes = ["long_iteration", "long_iteration"]
+    with pytest.raises(JobInterrupted, match="all processes have finished their work"):
+        run_job(cpu_supervisor(run, modes, signals=signals, waits=True, stop=0.1), act)
+    assert all((run.gmi(gmi).root / "saved").exists() for gmi in (0, 1))
+
+
+def test_a_gmi_that_hangs_after_ctrl_c_is_named(run: RunPaths):
+    signals = StopSignals()
+    supervisor = cpu_supervisor(run, ["train", "stall"], signals=signals, waits=True, stall=2.0)
+    with pytest.raises(GmiFailed, match="GMI 1 failed: made no progress after iteration 5 within"):
+        run_job(supervisor, once_all_iterate(lambda *_: signals.handle(signal.SIGINT)))
+    assert (run.gmi(0).root / "saved").exists()
+
+
+def test_a_signal_of_a_batch_system_after_ctrl_c_does_not_wait(run: RunPaths):
+    signals, sent = StopSignals(), []
+
+    def act(_: Supervisor, ticks: Ticks) -> None:
+        if all_iterate(ticks) and len(sent) < 2:
+            sent.append(signals.handle((signal.SIGINT, signal.SIGTERM)[len(sent)]))
+
+    with pytest.raises(JobInterrupted, match=r"GMIs \[0\] did not finish within 0.5 s"):
+        run_job(cpu_supervisor(run, ["deaf"], signals=signals, waits=True, stop=0.5), act)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_request_ends_at_once(
+    run: RunPaths, number: int, monkeypatch: pytest.MonkeyPatch
+):
+    now_s, signals = [100.0], StopSignals()
+    monkeypatch.setattr(
+        "gmijax.supervise.stop_signals.time", SimpleNamespace(monotonic=lambda: now_s[0])
+    )
+
+    def stop_again(_: Supervisor, ticks: Ticks) -> None:
         if all_iterate(ticks):
-            supervisor.request_stop()
+            signals.handle(number)
+            now_s[0] += 2.0
 
     with pytest.raises(JobInterrupted, match="second request"):
-        run_job(cpu_supervisor(run, ["deaf", "deaf"]), stop_again)
+        run_job(cpu_supervisor(run, ["deaf", "deaf"], signals=signals, waits=True), stop_again)
 
 
-def test_stop_request_while_compiling_ends_at_once(run: RunPaths):
+def test_a_signal_while_compiling_ends_at_once(run: RunPaths):
+    signals = StopSignals()
+    supervisor = cpu_supervisor(run, ["silent", "silent"], signals=signals, waits=True)
     with pytest.raises(JobInterrupted, match="before training began"):
-        run_job(cpu_supervisor(run, ["silent", "silent"]), lambda s, _: s.request_stop())
+        run_job(supervisor, lambda *_: signals.handle(signal.SIGINT))
 
 
 def test_exception_of_the_callback_ends_all(run: RunPaths):

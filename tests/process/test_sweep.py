@@ -117,6 +117,26 @@ def test_a_job_whose_controller_is_killed_goes_on_from_its_checkpoint(tmp_path: 
     assert re.search(r"\n  gmijax play run\.dir=all/00[01]\n$", out)
 
 
+@pytest.mark.timeout(400)
+def test_a_misspelt_objective_ends_a_sweep_soon_and_the_mended_command_goes_on(
+    tmp_path: Path,
+) -> None:
+    command = (*POINT, f"num_timesteps={40 * STEPS}", "seed=0,1", "run.dir=all")
+    wrong = ("sweep.objective=metric/distnace", FOREVER)
+    refused = train(*command, *wrong, cwd=tmp_path, command="sweep")
+    assert refused.returncode == 2
+    (line,) = refused.stderr.splitlines()
+    assert line.startswith(
+        "gmijax.sweep: sweep.objective=metric/distnace: not in the metrics of these jobs: did you "
+        "mean metric/distance?; continue: the command with that mended and run.dir=all"
+    )
+    assert report(tmp_path)["status"] == "failed"
+    assert states(tmp_path) == ["interrupted", "waiting"]
+    done = train(*command, "sweep.objective=metric/distance", cwd=tmp_path, command="sweep")
+    assert done.returncode == 0, done.stderr
+    assert len(report(tmp_path)["ranking"]) == 2
+
+
 def controller_of(order: Path) -> int:
     """The process of a job of a sweep."""
     for folder in Path("/proc").glob("[0-9]*"):

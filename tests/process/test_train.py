@@ -145,10 +145,16 @@ def test_a_resumed_run_logs_what_one_that_was_not_stopped_does(tmp_path: Path) -
 @pytest.mark.timeout(300)
 def test_an_interrupt_saves_and_stops_everything(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    job = start(*POINT, FOREVER, "plan.gpus=2", "run.dir=run", cwd=tmp_path)
+    # That is the time after other signals.
+    command = (*POINT, FOREVER, "plan.gpus=2", "run.stop_timeout_s=1e-6")
+    job = start(*command, "run.dir=run", cwd=tmp_path)
     wait_until(lambda: iteration_of(run, 1) >= 2, 120, "two iterations")
     job.send_signal(signal.SIGINT)
     assert job.wait(timeout=90) == 130
+    assert (
+        "finishing the iterations that have begun, then saving"
+        in (tmp_path / "stdout.txt").read_text()
+    )
     assert pids_of(run) == []
     assert _read(run / "summary.json")["status"] == "interrupted"
     checkpoint = find_checkpoint(str(run), "test")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import threading
 import time
@@ -26,6 +27,7 @@ from gmijax.machine.processes import has_ended, identify, wait_until_gone
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.heartbeat import Heartbeat
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import WatchedGmi
 from gmijax.sweeps import children
@@ -161,13 +163,16 @@ class ScriptedGmi(WatchedGmi):
     def close(self) -> None: ...
 
 
-def supervised(tmp_path: Path, state: Any) -> tuple[Supervisor, ScriptedGmi]:
+def supervised(
+    tmp_path: Path, state: Any, signals: StopSignals | None = None
+) -> tuple[Supervisor, ScriptedGmi]:
     run, here = RunPaths(tmp_path), machine(0)
     plan = planned(here, gmis_per_gpu=1)
     limits = dict.fromkeys(("start", "stall", "stop", "grace"), LIMIT_S)
     launch = make_launch(run, ["train"], plan, **limits)
     gmi = ScriptedGmi(0, run, state)
-    return Supervisor(launch, open_backend(plan, here, run), start=lambda _: gmi), gmi
+    backend = open_backend(plan, here, run)
+    return Supervisor(launch, backend, start=lambda _: gmi, signals=signals), gmi
 
 
 @pytest.mark.parametrize("state", ["starting", "compiling", "running", "done"])
@@ -186,12 +191,13 @@ def test_no_time_limit_runs_while_another_process_compiles(tmp_path: Path) -> No
 
 
 def test_a_gmi_that_is_to_stop_is_not_late(tmp_path: Path, stop: Stop) -> None:
-    supervisor, _ = supervised(tmp_path, "running")
+    signals = StopSignals()
+    supervisor, _ = supervised(tmp_path, "running", signals)
     is_so = after_looks(stop)
-    ask = iter([supervisor.request_stop])
 
     def tick(_: Any) -> None:
-        next(ask, lambda: None)()
+        if not signals.have_come:
+            signals.handle(signal.SIGTERM)
         is_so()
 
     with pytest.raises(JobInterrupted, match="all processes have finished their work"):

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from gmijax.control.exit_codes import exit_code_of
-from gmijax.supervise.run_gmis import STOP_SIGNALS
+from gmijax.supervise.stop_signals import STOP_SIGNALS
 
 
 @pytest.fixture(autouse=True)

@@ -298,6 +298,17 @@ def test_the_phase_of_several_gmis_is_that_of_the_job(states: tuple[str, ...], p
     assert said.getvalue().partition(" ")[0].strip(":") == ("" if phase == "running" else phase)
 
 
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_what_a_stop_waits_for_is_said_once(is_terminal: bool, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("gmijax.control.display.REFRESH_S", 0.0)
+    said = io.StringIO()
+    console = Console(file=said, width=300, force_terminal=is_terminal)
+    with ConsoleProgress(console, list, 10) as shown:
+        for state in ("running", "stopping", "stopping", "done"):
+            shown.update(_status(state, state))
+    assert said.getvalue().count("then saving; a second Ctrl-C ends at once, without saving") == 1
+
+
 def test_figures_of_before_a_restart_are_not_shown_while_it_compiles_again():
     said = io.StringIO()
     shown = ConsoleProgress(Console(file=said, width=300), lambda: [SYNC], 1000)

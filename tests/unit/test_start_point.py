@@ -166,6 +166,53 @@ def test_a_folder_that_exists_is_refused_before_anything_else(run: RunPaths):
         find_start_point(compose("env=ant", f"run.dir={run.root}", "num_envs=auto"))
 
 
+UNTRAINED = {"status": "failed", "algo": "ppo", "env_steps": None, "checkpoint": None}
+
+
+@pytest.mark.parametrize("status", ["failed", "interrupted"])
+def test_a_folder_in_which_nothing_was_trained_may_be_used_again(run: RunPaths, status: str):
+    write_json(run.summary, UNTRAINED | {"status": status})
+    found = find_start_point(compose("env=anymal", f"run.dir={run.root}"))
+    assert (found.folder, found.checkpoint) == (run, None)
+    assert found.notes == (f"nothing was trained in {run.root} before",)
+
+
+@pytest.mark.parametrize("is_saved", [False, True])
+def test_one_in_which_a_later_command_has_trained_is_not(run: RunPaths, is_saved: bool):
+    """It was killed, so the summary is still that of the one before."""
+    write_json(run.summary, UNTRAINED)
+    if is_saved:
+        save(run, 64)
+    else:
+        run.metrics.write_text('{"env_steps": 64}\n')
+    with pytest.raises(ConfigError, match=r"already; run\.resume=auto continues"):
+        find_start_point(compose("env=ant", f"run.dir={run.root}"))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"status": "completed"},
+        {"status": "running"},
+        {"algo": None},  # Of another command.
+    ],
+)
+def test_nor_is_any_other_folder(run: RunPaths, other: dict[str, Any]):
+    summary = {key: value for key, value in (UNTRAINED | other).items() if value or key != "algo"}
+    write_json(run.summary, summary)
+    with pytest.raises(ConfigError, match=r"already; run\.resume=auto continues"):
+        find_start_point(compose("env=ant", f"run.dir={run.root}"))
+
+
+def test_a_checkpoint_is_not_continued_in_such_a_folder(run: RunPaths, tmp_path: Path):
+    write_json(run.summary, UNTRAINED)
+    other = RunPaths(tmp_path / "other")
+    write_json(other.config, to_dict(config_of(other.root)))
+    save(other, 64)
+    with pytest.raises(ConfigError, match="the run folder exists already"):
+        find_start_point(compose("env=ant", f"run.dir={run.root}", f"run.resume={other.root}"))
+
+
 def test_serve_refuses_a_name_that_is_taken_before_it_searches(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import json
 import os
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,12 @@ from test_sweep_nodes import Sweep, jobs
 
 from gmijax.cli.command import sweep_command
 from gmijax.cli.compose import compose
+from gmijax.clock import running_s
 from gmijax.config.sweep import SweepConfig
-from gmijax.errors import GmijaxError
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.runs.folder import read_json
 from gmijax.runs.held import OpenFolder, locked
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps import report, scheduler
 from gmijax.sweeps.children import Child, Process
 from gmijax.sweeps.jobs import Job, jobs_of
@@ -70,12 +74,7 @@ def test_a_sweep_that_cannot_write_asks_running_jobs_to_save(
     what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sweep = Sweep(tmp_path, jobs(6))
-    orders: list[str] = []
-    for node in sweep.nodes:
-        order = node.order
-        monkeypatch.setattr(
-            node, "order", lambda child, do, order=order: (orders.append(do), order(child, do))
-        )
+    orders = orders_of(sweep, monkeypatch)
 
     def fill() -> None:
         sweep.nodes[1].end()
@@ -91,6 +90,102 @@ def test_a_sweep_that_cannot_write_asks_running_jobs_to_save(
     states = sweep.states()
     assert "running" not in states
     assert "interrupted" in states
+
+
+def orders_of(
+    sweep: Sweep, monkeypatch: pytest.MonkeyPatch, deaf_to: Collection[str] = ()
+) -> list[str]:
+    """What jobs are told from now on; to the orders `deaf_to` they do nothing."""
+    orders: list[str] = []
+    for node in sweep.nodes:
+
+        def order(child: int, do: Any, old: Any = node.order) -> None:
+            orders.append(do)
+            if do not in deaf_to:
+                old(child, do)
+
+        monkeypatch.setattr(node, "order", order)
+    return orders
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        ([signal.SIGINT], ["interrupt"]),
+        ([signal.SIGTERM], ["ask_to_stop"]),
+        ([signal.SIGINT, signal.SIGHUP], ["interrupt", "ask_to_stop"]),
+        ([signal.SIGUSR1, signal.SIGINT], ["ask_to_stop"]),
+    ],
+)
+def test_jobs_are_asked_once_and_once_more_if_it_becomes_urgent(
+    numbers: list[int], told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep, signals = Sweep(tmp_path, jobs(1)), StopSignals()
+    orders = orders_of(sweep, monkeypatch, deaf_to=("interrupt", "ask_to_stop"))
+
+    def wait() -> None: ...
+
+    def end() -> None:
+        for node in sweep.nodes:
+            node.end(130)
+
+    steps = [part for number in numbers for part in (partial(signals.handle, number), wait)]
+    with pytest.raises(JobInterrupted):
+        sweep.run(*steps, wait, end, signals=signals)
+    assert orders == [*told, "close"]
+    assert sweep.states() == ["interrupted"]
+
+
+def test_jobs_that_cannot_be_ranked_are_ended_at_their_first_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep = Sweep(tmp_path, jobs(6), objective="metric/distnace")
+    orders = orders_of(sweep, monkeypatch)
+
+    def report() -> None:
+        with sweep.paths.job(1).metrics.open("a") as file:
+            file.write(json.dumps({"env_steps": 9, "metric/distance": None}) + "\n")
+
+    with pytest.raises(ConfigError, match="did you mean metric/distance"):
+        sweep.run(report)
+    assert orders.count("ask_to_stop") == 4  # Those of all slots.
+    assert "kill" not in orders
+    assert sweep.states() == ["interrupted"] * 4 + ["waiting"] * 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_only_urgent_signals_give_jobs_a_time_to_end(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep, signals = Sweep(tmp_path, jobs(1)), StopSignals()
+    orders = orders_of(sweep, monkeypatch, deaf_to=("interrupt", "ask_to_stop"))
+    clock_s = [running_s()]
+    monkeypatch.setattr("gmijax.sweeps.running.running_s", lambda: clock_s[0])
+
+    def later() -> None:
+        clock_s[0] += 10_000.0
+
+    def end() -> None:
+        for node in sweep.nodes:
+            node.end(130)
+
+    with pytest.raises(JobInterrupted):
+        sweep.run(partial(signals.handle, number), later, later, end, signals=signals)
+    assert ("kill" in orders) == (number == signal.SIGTERM)
+
+
+def test_a_command_is_asked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It knows no urgency, and what a second signal does to it is not known."""
+    process = Process("job", ("sleep", "600"), tmp_path / "log", is_client=True)
+    child, sent = Child(process, {}), []
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "killpg", lambda _, number: sent.append(number))
+            child.interrupt()
+            child.ask_to_stop()
+        assert sent == [signal.SIGTERM]
+    finally:
+        child.close()
 
 
 def test_an_order_that_cannot_be_written_is_named(

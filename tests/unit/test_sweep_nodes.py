@@ -24,7 +24,7 @@ from gmijax.errors import BackendUnavailable, ConfigError, NodeLost
 from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.held import OpenFolder
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps import kind, nodes, profile_jobs, scheduler
 from gmijax.sweeps.children import ChildStatus
 from gmijax.sweeps.host import ChildStart, LocalHost, Order
@@ -74,7 +74,7 @@ class FakeHost(LocalHost):
         return self.seen.get(child)
 
     def order(self, child: int, order: Order) -> None:
-        if order in ("ask_to_stop", "kill"):
+        if order in ("ask_to_stop", "interrupt", "kill"):
             self.seen[child] = ChildStatus(130)
         if order == "close":
             del self.running[child]
@@ -97,7 +97,12 @@ class Sweep:
         plan = plan_slots(self.settings, machine(0), {"auto"})
         self.slots = SlotPool([Site(plan, node.machine, node.name) for node in self.nodes])
 
-    def run(self, *steps: Any, kind: type[TrainingKind] = TrainingKind) -> None:
+    def run(
+        self,
+        *steps: Any,
+        kind: type[TrainingKind] = TrainingKind,
+        signals: StopSignals | None = None,
+    ) -> None:
         """Runs it; the steps are called one after another, the last one in every tick."""
         left = list(steps)
 
@@ -106,7 +111,7 @@ class Sweep:
 
         ranking = self.settings
         args = kind(ranking, self.paths), ranking, self.paths, self.slots, self.nodes, tick
-        Scheduler(self.jobs, Study(), *args).run(StopSignals())
+        Scheduler(self.jobs, Study(), *args).run(signals or StopSignals())
 
     def states(self) -> list[str]:
         return [job.progress.state for job in self.jobs]

@@ -22,13 +22,13 @@ from gmijax.errors import ConfigError
 from gmijax.runs.folder import read_json, write_json
 from gmijax.runs.held import OpenFolder, is_locked, locked
 from gmijax.supervise.failures import may_be_anothers
-from gmijax.supervise.run_gmis import StopSignals
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps import curve_window, jobs_per_gpu
 from gmijax.sweeps.curve_window import CurveWindow
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import Job, jobs_of, placed, require_placeable, state_of
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
-from gmijax.sweeps.objective import why_not_comparable, with_objective
+from gmijax.sweeps.objective import require_logged, why_not_comparable, with_objective
 from gmijax.sweeps.packs import most_together, require_packable
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.profile_jobs import profiled_job
@@ -160,6 +160,35 @@ def test_jobs_are_ranked_by_evaluations_if_they_make_some() -> None:
     assert job.progress.curve == [(100, 2.0), (200, 1.0)]
 
 
+LINE = dict.fromkeys(
+    ("env_steps", "return", "window/return", "reward/near", "metric/distance", "loss/kl")
+)
+EVALUATED = LINE | {"eval/return": 1.0, "eval/length": 20.0}
+
+
+@pytest.mark.parametrize(
+    ("line", "objective", "said"),
+    [
+        (LINE, "metric/distnace", r": did you mean metric/distance\?"),
+        (LINE, "metric/speed", r": allowed are metric/distance"),
+        (LINE, "loss/entropy_of_policy", r": allowed are loss/kl"),
+        (LINE, "retrun", r": did you mean return\?"),
+        (LINE, "speed/x", r": allowed are env_steps, loss/kl, metric/distance, return, reward/"),
+        (EVALUATED, "eval/lenght", r": did you mean eval/length\?"),
+    ],
+)
+def test_an_objective_that_no_line_has_is_refused(
+    line: dict[str, Any], objective: str, said: str
+) -> None:
+    with pytest.raises(ConfigError, match=rf"^sweep\.objective={objective}: not in the.*{said}"):
+        require_logged(line, objective)
+
+
+@pytest.mark.parametrize("objective", ["return", "metric/distance", "eval/length", "eval/x"])
+def test_an_objective_may_be_null_or_come_with_an_evaluation(objective: str) -> None:
+    require_logged(LINE, objective)
+
+
 @pytest.mark.parametrize(
     ("objective", "overrides", "warns"),
     [
@@ -187,6 +216,14 @@ def test_a_sweep_says_that_its_jobs_compile_first_unless_all_have_run() -> None:
     for job in work.jobs:
         job.progress.state = "completed"
     assert not work.warnings(())
+
+
+@pytest.mark.parametrize(("num_gpus", "says"), [(0, True), (1, False)])
+def test_a_sweep_of_what_is_meant_for_a_gpu_says_so_once(num_gpus: int, says: bool) -> None:
+    here = machine(num_gpus)
+    sites = [Site(plan_slots(SweepConfig(jobs_per_gpu=1), here, {"auto"}), here)]
+    lines = build_sweep(("env=ant", "seed=0,1")).warnings(sites)
+    assert sum("are meant for a GPU" in line for line in lines) == says
 
 
 def gpu_slots(gpus: int, jobs_per_gpu: int) -> SlotPool:

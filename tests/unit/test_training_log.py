@@ -129,7 +129,9 @@ def test_an_evaluation_is_in_the_line_of_its_iteration_and_in_no_rate() -> None:
 def test_terms_and_metrics_are_means_over_episodes() -> None:
     window = EpisodeWindow()
     window.add(EpisodeSums(0, 0.0, 0, {"alive": 0.0}, {"successes": 0.0}))
-    assert window.means() == {"return": None, "episode_length": None}
+    names = ("return", "episode_length", "reward/alive", "metric/successes")
+    assert window.means() == dict.fromkeys(names)  # From the first line on.
+    assert set(window.line()) >= {f"window/{name}" for name in names}
     window.add(EpisodeSums(1, 4.0, 10, {"alive": 2.0}, {"successes": 3.0}))
     window.add(EpisodeSums(3, 8.0, 30, {"alive": 6.0}, {"successes": 5.0}))
     assert window.means() == {
