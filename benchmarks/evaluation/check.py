@@ -102,7 +102,7 @@ def count(root: Path = ROOT) -> Count:
             for match in FIGURE.finditer(text):
                 total += of_figure(match[2])
             for match in TABLE.finditer(text):
-                total += of_table(match[2], match[3])
+                total += of_table(match[3])
     return total
 
 

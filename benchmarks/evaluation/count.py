@@ -4,7 +4,7 @@ A figure is a marked one, or a cell with a digit in a column of numbers that are
 believed if its file has commit and date, and it is of three runs or more. A cell says of how many
 it is (`n=3`, `5 of 20`); one that does not is of as many as every case of its files, at least one;
 a ratio, of as many as the cells of its row. Files are those below a table, or the one that a row
-names. Not counted: predictions, and tables of words, which repeat figures of others.
+names. Not counted: tables of words, which repeat figures of others.
 """
 
 from __future__ import annotations
@@ -33,9 +33,8 @@ SETTINGS = frozenset(
         *("at the end: million steps", "faults"),
     )
 )
-"""Columns of numbers that were chosen, counted or predicted."""
+"""Columns of numbers that were chosen or counted."""
 
-PREDICTIONS = frozenset(("node-scaling",))
 _RATIO = re.compile(r"over |ratio|of ideal|measured$|two GMIs")
 _OF = re.compile(r"n=(\d+)|\d+ of (\d+)")
 _REPEATS = re.compile(r"(\d+)(?: to \d+)? runs? of each case")
@@ -69,11 +68,9 @@ def of_figure(reference: str) -> Count:
     return Count(1, int(bool(has_origin and min(map(len, values)) >= LEAST)))
 
 
-def of_table(name: str, text: str) -> Count:
+def of_table(text: str) -> Count:
     """Of a table as it stands in a document: one head or several, files below each."""
     total = Count()
-    if name in PREDICTIONS:
-        return total
     lines = text.splitlines()
     rules = [at for at, line in enumerate(lines) if re.match(r"\| ---", line)]
     for at, end in zip(rules, [*(at - 1 for at in rules[1:]), len(lines)], strict=False):

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import node_scaling as scaling
 from benchmarks.evaluation.figures import (
     Figure,
     bounds,
@@ -17,9 +16,7 @@ from benchmarks.evaluation.figures import (
 from benchmarks.evaluation.writer import (
     Calls,
     Rows,
-    lines,
-    made_with,
-    source,
+    newest,
     table,
     table_of_calls,
 )
@@ -81,7 +78,12 @@ REDUCTION_HEAD = (
 )
 
 
-@table_of_calls("reduction", REDUCTION_HEAD, scaling.reductions)
+def reductions() -> Calls:
+    """The newest call of `benchmarks.reduction` on GPUs."""
+    return newest("reduction-nvidia-*.json", lambda _: "newest")
+
+
+@table_of_calls("reduction", REDUCTION_HEAD, reductions)
 def reduction(calls: Calls) -> Rows:
     """A mean of 1.5 million numbers, alone and in a chain."""
     rows = [row for call, _ in calls.values() for row in call.results["rows"]]
@@ -105,21 +107,9 @@ def read_layout(text: str) -> str:
 
 def model_fit() -> str:
     """Measured over predicted time of all reductions of the paper's strategies."""
-    rows = scaling.reduction_results().get("rows", ())
+    rows = [row for call, _ in reductions().values() for row in call.results["rows"]]
     fits = [row["median_s"] / row["predicted_s"] for row in rows if row["predicted_s"]]
     return bounds(fits, ".3g")
-
-
-@lines("node-scaling")
-def node_scaling() -> list[str]:
-    """What the cost model predicts for several nodes, and how far off it was on one."""
-    fits = [f"{bounds(scaling.model_fit(way), '.2g')} (`{way}`)" for way in scaling.PATHS]
-    fit = (
-        f"Measured over predicted time of a mean on one node, one GMI on each GPU: "
-        f"{' and '.join(fits)}; all strategies and layouts: {model_fit()}."
-    )
-    below = [*source(scaling.RATES), *made_with(scaling.reductions())]
-    return [*scaling.table(), "", fit, *below]
 
 
 @table("faults", "fault | seconds until all GMIs train again:", "faults-h200")
