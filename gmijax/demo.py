@@ -98,7 +98,7 @@ def _next_steps(task: str) -> tuple[tuple[str, str], ...]:
     others = [name for name in shipped_tasks() if name != task]
     if not others:
         return watch, train
-    other = f"see another task, of {', '.join(others)}", f"gmijax demo env={others[0]}"
+    other = f"see another task: {', '.join(others)}", f"gmijax demo env={others[0]}"
     return watch, other, train
 
 

@@ -175,7 +175,7 @@ def show(found: Diagnosis, console: UserConsole) -> None:
     for problem in found.problems:
         console.print(f"problem: {problem}")
     if not found.problems:
-        console.print("nothing is broken")
+        console.print("no problems found")
 
 
 _OF_GPUS: Final = ("backend", "reducer", "intra")

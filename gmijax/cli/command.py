@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import zip_longest
 from typing import Any, Final
 
 from omegaconf import OmegaConf
@@ -79,9 +80,11 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
             raise ConfigError(f"--cfg {' '.join(arguments[at + 1 : at + 2])}: allowed is job")
         del arguments[at : at + 2]
         show = True
-    for text in arguments:
+    for text, after in zip_longest(arguments, arguments[1:], fillvalue="-"):
         if text.startswith("-"):
             key, equals, value = text.lstrip("-").partition("=")
+            if not equals and not after.startswith("-"):
+                equals, value = "=", after  # `--num-envs 64`, as others have it.
             meant = f"; did you mean {key.replace('-', '_')}={value}?" if key and equals else ""
             allowed = "--help, --verbose, --cfg job, key=value"
             raise ConfigError(f"unknown option {text}: allowed are {allowed}{meant}")

@@ -146,5 +146,5 @@ def training_of(task: str, *, has_gpu: bool) -> tuple[str, str]:
     """A training as a step for `print_next`; without a GPU that of a task small enough."""
     if has_gpu or task == SMALL_TASK:
         return f"train {task} yourself", f"gmijax train env={task}"
-    purpose = f"train one yourself; a CPU learns {SMALL_TASK} within minutes, {task} takes a GPU"
+    purpose = f"train one yourself; a CPU learns {SMALL_TASK} within minutes, {task} needs a GPU"
     return purpose, f"gmijax train env={SMALL_TASK}"

@@ -257,6 +257,6 @@ def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
             raise ConfigError(f"{run.plan}: {error}") from None
         summary = train_summary(config, plan, run, "completed", 0.0, [])
         write_json(run.summary, summary)
-    console.print(f"nothing is left to do: {nearby(run.root)}")
+    console.print(f"this run is complete already: {nearby(run.root)}")
     print_next(console, *next_steps(run))
     return Result(run.root, summary)

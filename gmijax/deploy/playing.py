@@ -157,15 +157,15 @@ def _return_while_training(config: PlayConfig, returns: Mapping[str, Any]) -> st
 def _next_steps(config: PlayConfig, label: str) -> tuple[tuple[str, str], ...]:
     if config.checkpoint == SHIPPED:
         task = config.run.env
-        return (
-            ("watch it in the browser", f"gmijax view env={task} checkpoint={SHIPPED}"),
-            training_of(str(task), has_gpu=bool(detect_machine().gpus)),
-        )
+        view = ("watch it in the browser", f"gmijax view env={task} checkpoint={SHIPPED}")
+        train = training_of(str(task), has_gpu=bool(detect_machine().gpus))
+        return (train,) if missing() else (view, train)
     folder = shlex.quote(nearby(Path(str(config.run.dir))))
     view = ("watch it in the browser", f"gmijax view run.dir={folder}")
     export = ("write the policy as files for a robot", f"gmijax export run.dir={folder}")
     # The viewer has our tasks alone, and needs what checkpoints of older versions do not have.
-    can_view = label in TASKS and (Path(str(config.checkpoint)) / POLICY).exists()
+    has_policy = (Path(str(config.checkpoint)) / POLICY).exists()
+    can_view = label in TASKS and has_policy and not missing()
     return (view, export) if can_view else (export,)
 
 

@@ -153,7 +153,10 @@ class PackWork(Work[CommandJob]):
     @property
     def unranked(self) -> str:
         """See `Work`."""
-        return "no reward was found in the output: pack.metric or pack.tag says where it is"
+        return (
+            "no reward was found in the output: pack.metric says where it is, e.g. "
+            "pack.metric='reward (-?[\\d.]+)', or pack.tag; steps by pack.steps='step (\\d+)'"
+        )
 
     def state_of(self, run: RunPaths, job: CommandJob) -> State:
         """See `Work`."""

@@ -33,6 +33,8 @@ APART = "plan.serving_gpus, plan.training_gpus: GPUs [1] both act and train and 
 REFUSED: list[tuple[str, str, str]] = [
     # Keys and options that are not there.
     ("train", "env=antt", "env=antt: unknown task: did you mean ant?"),
+    ("train", "env=brax:ant", "unknown task: did you mean env=brax env.name=ant?"),
+    ("sweep", "env=playground:Go1Getup", "did you mean env=playground env.name=Go1Getup?"),
     ("train", "algo=td3", "algo=td3: unknown algorithm: allowed are a3c, distill, ppo, sac"),
     ("train", "num_env=3", "unknown key num_env: did you mean num_envs?"),
     ("train", "algo.gamma=0.9", "unknown key algo.gamma: did you mean algo.discounting?"),
@@ -44,6 +46,8 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "ent=ant", "unknown key ent: did you mean env?"),
     ("train", "--num-envs=64", "unknown option --num-envs=64: allowed are --help, --verbose, "),
     ("train", "--num-envs=64", "; did you mean num_envs=64?"),
+    ("train", "--num_envs 64", "; did you mean num_envs=64?"),
+    ("sweep", "--seed 1 --quiet", "unknown option --seed: allowed are --help, --verbose, "),
     ("train", "seed=0,1", "(a list stands in brackets); gmijax sweep takes several"),
     ("train", "lr=1", "unknown key lr: did you mean algo.learning_rate?"),
     ("train", "total_timesteps=1", "unknown key total_timesteps: did you mean num_timesteps?"),

@@ -155,7 +155,7 @@ def test_help_marks_tasks_that_are_not_installed(
 def test_without_a_gpu_nobody_is_told_to_train_for_hours(num_gpus: int, task: str, command: str):
     purpose, line = training_of(task, has_gpu=bool(num_gpus))
     assert line == command
-    assert ("takes a GPU" in purpose) == (task not in command)
+    assert ("needs a GPU" in purpose) == (task not in command)
 
 
 @pytest.mark.parametrize(
