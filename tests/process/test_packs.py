@@ -197,6 +197,9 @@ def test_without_a_reward_the_table_has_what_is_known_and_a_hint(tmp_path: Path)
     assert lines[heading].split() == ["job", "overrides", "time", "state"]
     assert lines[heading + 1].split()[:3] == ["0", "x=1", "seed=0"]
     assert not [text for text in lines if " - " in text or "metric -" in text]
-    hint = "no reward was found in the output: pack.metric says where it is, e.g. pack.metric="
+    hint = (
+        "no reward was found in the output: pack.metric says where it is, e.g. "
+        r"pack.metric='reward (-?[\d.]+)', or pack.tag; steps by pack.steps='step (\d+)'"
+    )
     assert lines.index(hint) < heading  # As soon as the first job is complete, and at the end.
     assert lines.count(hint) == 2
