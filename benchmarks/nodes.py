@@ -90,8 +90,7 @@ class Benchmark:
         config = gmijax.compose(*self._overrides)
         self._task = f"`{config.env.slug}`, {config.num_envs:,} environments in a GMI"
         self._deadline_s = deadline(given.deadline_s)
-        device = f"2 x {machine.gpus[0].name}" if machine.gpus else None
-        self.file = results_file(given, "nodes", device=device)
+        self.file = results_file(given, "nodes", gpus=2)
 
     def run(self, cases: Sequence[Case], root: Path) -> int:
         """Runs them in turn, in folders below `root`; how many runs succeeded."""

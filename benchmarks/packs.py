@@ -45,9 +45,7 @@ class Benchmark:
 
     def __init__(self, given: argparse.Namespace, machine: Machine) -> None:
         self._given, self._machine = given, machine
-        # Each row is of one GPU, however many work at the same time.
-        of_one = f"1 x {machine.gpus[0].name}" if machine.gpus else None
-        self._file = results_file(given, "packs", device=of_one)
+        self._file = results_file(given, "packs", gpus=1)
         self._deadline_s = deadline(given.deadline_s)
 
     def run(self, ways: Sequence[Way]) -> bool:

@@ -29,6 +29,9 @@ from gmijax.version import versions_of
 
 RESULTS = Path(__file__).parent / "results"
 FORMAT = 2
+CPU = "cpu"
+"""The device where there is no GPU."""
+
 COMMIT_VARIABLE = "GMIJAX_COMMIT"
 """The commit, where the code is a copy without `.git`: `git describe --always --dirty`."""
 
@@ -121,11 +124,17 @@ class ResultsFile:
 
 
 def results_file(
-    given: argparse.Namespace, suite: str, of: str = "", *, device: str | None = None
+    given: argparse.Namespace, suite: str, of: str = "", *, gpus: int | None = None
 ) -> ResultsFile:
-    """The file of a benchmark here, e.g. `seeds-ant-nvidia-h200.json` with `of="-ant"`."""
-    path = given.out / file_name(f"{suite}{of}", device_name())
-    return ResultsFile(path, suite, vars(given), device=device)
+    """The file of a benchmark here, e.g. `seeds-ant-nvidia-h200.json` with `of="-ant"`.
+
+    `gpus` are those that each of its rows is of, however many work at the same time; None: all.
+    """
+    name = device_name()
+    device = None if gpus is None or name == CPU else f"{gpus} x {name}"
+    return ResultsFile(
+        given.out / file_name(f"{suite}{of}", name), suite, vars(given), device=device
+    )
 
 
 def read_calls(path: Path) -> list[Call]:
@@ -177,9 +186,9 @@ def file_name(suite: str, device: str) -> str:
 
 
 def device_name() -> str:
-    """The first GPU that a job may use here, or `cpu`."""
+    """The first GPU that a job may use here, or `CPU`."""
     gpus = detect_machine().gpus
-    return gpus[0].name if gpus else "cpu"
+    return gpus[0].name if gpus else CPU
 
 
 def _begin(settings: Mapping[str, Any], device: str | None) -> Call:
@@ -191,7 +200,7 @@ def _begin(settings: Mapping[str, Any], device: str | None) -> Call:
         is_dirty=is_dirty,
         date=datetime.now().astimezone().isoformat(timespec="microseconds"),
         host=f"{platform.node()}, {os.cpu_count()} cores, {platform.platform()}",
-        device=device or ", ".join(f"{n} x {name}" for name, n in counts.items()) or "cpu",
+        device=device or ", ".join(f"{n} x {name}" for name, n in counts.items()) or CPU,
         driver=machine.driver_version,
         versions={"python": platform.python_version(), **versions_of(_VERSIONS)},
         command=shlex.join(["python", *sys.orig_argv[1:]]),

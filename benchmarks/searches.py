@@ -27,9 +27,7 @@ _KEPT = ("env", "best", "reason", "complete", "points", "num_profiled", "wall_s"
 def main() -> int:
     """Searches what the command line asks for; returns 1 if a search has no answer, else 0."""
     given, machine = _options(), detect_machine()
-    # A search has one GPU, however many work at the same time.
-    of_one = f"1 x {machine.gpus[0].name}" if machine.gpus else None
-    file, deadline_s = results_file(given, "searches", device=of_one), deadline(given.deadline_s)
+    file, deadline_s = results_file(given, "searches", gpus=1), deadline(given.deadline_s)
 
     def run(task: str, part: Part) -> int:
         code, found = _search(task, part, given.overrides, deadline_s)

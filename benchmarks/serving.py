@@ -65,9 +65,7 @@ class Setting(NamedTuple):
 def main() -> int:
     """Measures what the command line asks for; returns 1 if a job failed, else 0."""
     given, machine = _options(), detect_machine()
-    # A case has one GPU, however many work at the same time.
-    of_one = f"1 x {machine.gpus[0].name}" if machine.gpus else None
-    file = results_file(given, "serving", device=of_one)
+    file = results_file(given, "serving", gpus=1)
 
     def run(setting: Setting, part: Part) -> None:
         case = measure(setting, given, part)

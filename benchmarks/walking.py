@@ -62,9 +62,7 @@ class Benchmark:
         self._deadline_s = deadline(given.deadline_s)
         self._trained_by_s = self._deadline_s - given.reserve_s
         self._machine = detect_machine()
-        # A training has one GPU, however many work at the same time.
-        of_one = f"1 x {self._machine.gpus[0].name}" if self._machine.gpus else None
-        self.file = results_file(given, "walking", f"-{config.env.slug}", device=of_one)
+        self.file = results_file(given, "walking", f"-{config.env.slug}", gpus=1)
         self.runs: list[dict[str, Any]] = []
         self._codes_of_tests: list[int] = []
 

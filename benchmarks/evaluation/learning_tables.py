@@ -21,7 +21,7 @@ from benchmarks.evaluation.seed_tables import of_algorithms
 from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
 from benchmarks.outcomes import seconds_to
 from benchmarks.records import RESULTS, Call, calls_by_date
-from benchmarks.walking import SCRIPT
+from benchmarks.walking import OURS, SCRIPT
 
 NEARLY = 0.9
 """Of a return, that is reached more surely than all of it."""
@@ -224,9 +224,10 @@ def seconds_until_it_walks(task: str) -> Figure | None:
     calls = newest("walking-*-nvidia-*.json", _kind_of_walking)
     for (of, algo, _, is_cold), (call, _) in calls.items():
         if (of, algo, is_cold) == (task, "SAC", False):
-            ours = [run for run in call.results["runs"] if run["trainer"] != SCRIPT]
-            found = [run["walks_from"]["training_s"] for run in ours if run["walks_from"]]
-            return figure(found) if len(found) == len(ours) else None
+            row = call.results["rows"][OURS]
+            if row["walk"] == row["seeds"]:
+                low, median, high = row["training_s"]
+                return Figure(median, low, high, row["walk"])
     return None
 
 

@@ -216,13 +216,13 @@ def _check_override(name: str, item: Override) -> None:
         raise ConfigError(f"{item.input_line}: expected ~{key}")
     if options and not item.is_delete() and item.value() not in options:
         # Of a few the closest name is a guess: `algo=td3` is no slip for a3c.
-        few = f": allowed are {', '.join(options)}" if len(options) < 5 else ""
+        hint = f": allowed are {', '.join(options)}" if len(options) < 5 else ""
         kind = {"env": " task", "algo": " algorithm"}.get(key, "")
         suite, colon, of_suite = str(item.value()).partition(":")
         if key == "env" and colon and suite in options:  # As labels and run folders have it.
-            few = f": did you mean env={suite} env.name={of_suite}?"
+            hint = f": did you mean env={suite} env.name={of_suite}?"
         raise ConfigError(
-            f"{key}={item.value()}: unknown{kind}{few or suggestion(str(item.value()), options)}"
+            f"{key}={item.value()}: unknown{kind}{hint or suggestion(str(item.value()), options)}"
         )
 
 

@@ -51,9 +51,9 @@ class PolicyConfig(KeyGroup):
     """`module:name` of the `gmijax.learning.algorithm.Algorithm`, where every GMI simulates, acts
     and trains; jax is imported with it."""
     fixed_keys: ClassVar[tuple[str, ...]] = ("activation", "state_dependent_std")
+    """What a resumed run cannot change, since its weights depend on it."""
     small_keys: ClassVar[tuple[str, ...]] = ()
     """What a small try on a CPU changes, beside the numbers of environments and steps."""
-    """What a resumed run cannot change, since its weights depend on it."""
     templates: ClassVar[tuple[Literal["tcg_ex", "tdg_ex", "decoupled"], ...]] = ("tcg_ex",)
     """Which GMIs have which role (`gmijax.partition.templates`), the first one by default."""
 

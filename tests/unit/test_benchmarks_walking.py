@@ -68,7 +68,8 @@ def test_a_folder_of_trainings_is_not_used_twice(tmp_path, monkeypatch):
 
 def test_every_seed_is_trained_and_tested_on_a_gpu_of_its_own(tmp_path, monkeypatch):
     gpus = tuple(Gpu(n, f"GPU-{n}", "some GPU", 80000, (9, 0), False) for n in (0, 1))
-    monkeypatch.setattr(walking, "detect_machine", lambda: Machine(gpus, tuple(range(8))))
+    for user in (walking, records):
+        monkeypatch.setattr(user, "detect_machine", lambda: Machine(gpus, tuple(range(8))))
     ran = []
 
     def run_command(command, deadline_s, variables):
