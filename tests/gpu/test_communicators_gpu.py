@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from training_jobs import POINT_TASK, STEPS, TINY, learner_arrays, train
 
-from gmijax.machine.nvidia import list_gpus
+from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import why_no_nccl, why_not_intra
 from tests.communicator_contract import (
@@ -52,7 +52,7 @@ WAYS = {
 
 def _gpus(count: int) -> list[int]:
     """Indices of `count` GPUs."""
-    found = [gpu.index for gpu in list_gpus()]
+    found = [gpu.index for gpu in detect_machine().gpus]
     if len(found) < count:
         pytest.skip(f"needs {count} GPUs")
     worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))

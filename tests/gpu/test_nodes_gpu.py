@@ -31,7 +31,7 @@ from training_jobs import (
 )
 
 from benchmarks.two_ray_nodes import RAY, Cluster, two_nodes
-from gmijax.machine.nvidia import list_gpus
+from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.reduction import why_no_bindings, why_no_nccl
 
 pytestmark = [
@@ -50,7 +50,7 @@ WAYS = {"direct": (), "sockets": SOCKETS}
 def gpus() -> list[int]:
     if reason := why_no_nccl() or why_no_bindings():
         pytest.skip(reason)
-    found = [gpu.index for gpu in list_gpus()]
+    found = [gpu.index for gpu in detect_machine().gpus]
     if len(found) < 2:
         pytest.skip("needs 2 GPUs")
     return found[:2]
