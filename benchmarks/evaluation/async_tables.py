@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.cases import SUITES, Case
+from benchmarks.evaluation.evidence import Ratio
 from benchmarks.evaluation.figures import (
     TRAINING,
     WHOLE_RUN,
@@ -16,6 +17,7 @@ from benchmarks.evaluation.figures import (
     ratio,
     results_of,
     shown,
+    sources_of,
     summaries,
 )
 from benchmarks.evaluation.paper import CHANNELS
@@ -65,7 +67,7 @@ def several_learners() -> Rows:
         ]
 
 
-def learners_over_one() -> list[float | None]:
+def learners_over_one() -> list[Ratio | None]:
     """Steps/s of learners on two GPUs over one, of every case."""
     base, *others = (one.name for one in SUITES[LEARNERS])
     return [ratio(LEARNERS, case, base) for case in others]
@@ -78,7 +80,8 @@ def _drawn(case: str) -> Figure | None:
         return None
     algo = config["algo"]
     for_each_step = algo["updates_per_step"] * algo["batch_size"] / config["num_envs"]
-    return figure([for_each_step * one[TRAINING] for one in summaries(LEARNERS, case)])
+    drawn = [for_each_step * one[TRAINING] for one in summaries(LEARNERS, case)]
+    return figure(drawn, *sources_of(LEARNERS))
 
 
 @table(
@@ -96,13 +99,13 @@ def asynchronous_long() -> Rows:
         yield [case.name, cells[0], gains[0], cells[1], gains[1], cells[2]]
 
 
-def over_synchronous(case: Case, key: str = TRAINING) -> float | None:
+def over_synchronous(case: Case, key: str = TRAINING) -> Ratio | None:
     """A case of `LONG` over synchronous training on as many GPUs."""
     base = next(one.name for one in SUITES[LONG] if one.gpus == case.gpus)
     return ratio(LONG, case.name, base, key)
 
 
-def asynchronous_gains(gpus: int) -> list[float | None]:
+def asynchronous_gains(gpus: int) -> list[Ratio | None]:
     """Of every asynchronous case of `LONG` on so many GPUs."""
     cases = [one for one in SUITES[LONG] if one.gpus == gpus and "synchronous" not in one.name]
     return [over_synchronous(case) for case in cases]

@@ -12,6 +12,7 @@ from benchmarks.evaluation.figures import (
     figure,
     results_of,
     shown,
+    sources_of,
 )
 from benchmarks.evaluation.writer import (
     Calls,
@@ -123,7 +124,7 @@ def seconds_to_recover() -> dict[str, Figure | None]:
     kinds: dict[str, list[float]] = {}
     for row in results_of("faults-h200").get("rows", ()):
         kinds.setdefault(row["fault"], []).append(row["seconds"])
-    return {kind: figure(seconds) for kind, seconds in kinds.items()}
+    return {kind: figure(s, *sources_of("faults-h200")) for kind, s in kinds.items()}
 
 
 @table(

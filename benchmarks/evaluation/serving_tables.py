@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
+from benchmarks.evaluation.evidence import Evidence, Ratio, source
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
 from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
 from benchmarks.paper_model import Task, serving_gain
@@ -47,23 +48,32 @@ def serving_rate(task: str, gmis: int, backend: str = "mps") -> Figure | None:
     """Steps/s of serving in GMIs that share 8192 environments."""
     case = _case(task, gmis, backend)
     runs = case["runs"]["tcg"] if case else ()
-    return figure([run["step_per_s_inference"] for run in runs])
+    sources = [source(path.stem, call) for call, path in _of_backends().values()]
+    return figure([run["step_per_s_inference"] for run in runs], *sources)
 
 
-def mps_over_share(task: str, gmis: int) -> float | None:
+def mps_over_share(task: str, gmis: int) -> Ratio | None:
     """Steps/s under MPS over those of plain sharing."""
     return over(serving_rate(task, gmis), serving_rate(task, gmis, "share"))
 
 
-def mps_over_one(task: str, gmis: int) -> float | None:
+def mps_over_one(task: str, gmis: int) -> Ratio | None:
     """Steps/s of GMIs under MPS over one process, of one call."""
     return over(serving_rate(task, gmis), serving_rate(task, 1))
 
 
-def templates_gains() -> list[float]:
+def templates_gains() -> list[Ratio]:
     """Steps/s of one GMI for all tasks over one for each, of every case."""
-    cases = [case for case in _cases(_of_templates()) if "simulator_s" in case]
-    return [case["colocated"] / case["dedicated"] for case in cases]
+    calls = _of_templates()
+    sources = frozenset(source(path.stem, call) for call, path in calls.values())
+    cases = [case for case in _cases(calls) if "simulator_s" in case]
+    return [
+        Ratio(
+            case["colocated"] / case["dedicated"],
+            Evidence(min(map(len, case["runs"].values())), sources),
+        )
+        for case in cases
+    ]
 
 
 @table_of_calls(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
+from benchmarks.evaluation.evidence import Ratio, Source, source
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
 from benchmarks.evaluation.writer import line_of, lines, markdown
 from benchmarks.records import Call, calls_by_date
@@ -26,14 +27,16 @@ class SameJobs(NamedTuple):
     Attributes:
       calls: that ran them, as lines of Markdown.
       runs: the number of the call, the way, and what succeeded in it.
+      sources: the calls.
     """
 
     calls: list[str]
     runs: list[tuple[int, str, Run]]
+    sources: list[Source]
 
     def rates(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
         """A figure of all sweeps, by way."""
-        return _figures((way, run[key]) for _, way, run in self.runs)
+        return _figures(((way, run[key]) for _, way, run in self.runs), self.sources)
 
     def gains(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
         """A figure over that of one after another, each ratio of one call."""
@@ -44,21 +47,25 @@ class SameJobs(NamedTuple):
         return self._ratios(lambda way: way.replace(", auto", ", share"), "trainings_per_hour")
 
     def _ratios(self, base_of: Callable[[str], str], key: str) -> dict[str, Figure]:
-        of_call = _figures(((number, way), run[key]) for number, way, run in self.runs)
-        return _figures(
+        rates = (((number, way), run[key]) for number, way, run in self.runs)
+        of_call = _figures(rates, self.sources)
+        gains = (
             (way, found.median / of_call[number, base].median)
             for (number, way), found in of_call.items()
             if (base := base_of(way)) != way and (number, base) in of_call
         )
+        return _figures(gains, self.sources)
 
 
-def _figures(values: Iterable[tuple[Key, float | None]]) -> dict[Key, Figure]:
+def _figures(
+    values: Iterable[tuple[Key, float | None]], sources: Sequence[Source]
+) -> dict[Key, Figure]:
     """Those with the same key together, without what has no value."""
     together: dict[Key, list[float]] = {}
     for key, value in values:
         if value is not None:
             together.setdefault(key, []).append(value)
-    return {key: median for key, found in together.items() if (median := figure(found))}
+    return {key: median for key, found in together.items() if (median := figure(found, *sources))}
 
 
 def same_jobs() -> dict[str, SameJobs]:
@@ -68,9 +75,10 @@ def same_jobs() -> dict[str, SameJobs]:
         for run in call.results["runs"]:
             at_once, backend, *tasks = run["way"].split(", ")
             if run["status"] == "completed":
-                same = found.setdefault(_described(call, tasks), SameJobs([], []))
+                same = found.setdefault(_described(call, tasks), SameJobs([], [], []))
                 if number not in {one for one, *_ in same.runs}:
                     same.calls.append(line_of(path.name, call))
+                    same.sources.append(source(path.stem, call))
                 same.runs.append((number, f"{at_once}, {backend}", run))
     return found
 
@@ -80,23 +88,18 @@ def first_gains(key: str = "trainings_per_hour") -> dict[str, Figure]:
     return next((same.gains(key) for same in same_jobs().values()), {})
 
 
-def program_over_processes() -> dict[str, str]:
-    """Eight jobs as one program, over the same jobs in eight processes, and of how many sweeps.
+def program_over_processes(key: str = "trainings_per_hour") -> Ratio | None:
+    """Eight jobs as one program, over the same jobs in eight processes.
 
     Of the jobs that were measured most often so, the newest.
     """
-    found = {"steps": NOT_MEASURED, "finished": NOT_MEASURED, "n": "0"}
+    best = None
     for same in same_jobs().values():
-        gains = {}
-        for name, key in (("steps", "steady_steps_per_s"), ("finished", "trainings_per_hour")):
-            rates = same.rates(key)
-            program, processes = rates.get("8 at once, vmap"), rates.get("8 at once, auto")
-            if program and processes:
-                gains[name] = shown(over(program, processes))
-                gains["n"] = str(min(program.repeats, processes.repeats))
-        if len(gains) == len(found) and int(gains["n"]) >= int(found["n"]):
-            found = gains
-    return found
+        rates = same.rates(key)
+        gain = over(rates.get("8 at once, vmap"), rates.get("8 at once, auto"))
+        if gain and (best is None or gain.evidence.repeats >= best.evidence.repeats):
+            best = gain
+    return best
 
 
 @lines("sweeps")
