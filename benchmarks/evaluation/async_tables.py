@@ -20,6 +20,7 @@ from benchmarks.evaluation.figures import (
     sources_of,
     summaries,
 )
+from benchmarks.evaluation.learning_tables import NEARLY, times_to
 from benchmarks.evaluation.paper import CHANNELS
 from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
 from benchmarks.records import Call
@@ -52,25 +53,29 @@ def asynchronous() -> Rows:
 @table(
     LEARNERS,
     "ant, SAC | PPS: | over one GPU: | TTOP, transitions drawn a second: | over one GPU: "
-    "| the paper's A3C, PPS / TTOP:",
+    "| the paper's A3C, PPS / TTOP: | seconds to nine tenths of one GPU's return:",
     LEARNERS,
 )
 def several_learners() -> Rows:
     """Learners that act, each with its own replay, and average their gradients."""
     base = SUITES[LEARNERS][0].name
+    final = rate(LEARNERS, base, "final_return")
     for case in (one.name for one in SUITES[LEARNERS]):
+        found = times_to(NEARLY * final.median, LEARNERS, case) if final else []
+        seconds = figure([one for one in found if one is not None])
         acting, drawn = rate(LEARNERS, case), _drawn(case)
         paper = "1 / 1" if case == base else "1.88 / 1.65"
         yield [
             *(case, shown(acting, ",.0f"), shown(over(acting, rate(LEARNERS, base)))),
             *(shown(drawn, ",.0f"), shown(over(drawn, _drawn(base))), paper),
+            shown(seconds, ".1f"),
         ]
 
 
-def learners_over_one() -> list[Ratio | None]:
-    """Steps/s of learners on two GPUs over one, of every case."""
-    base, *others = (one.name for one in SUITES[LEARNERS])
-    return [ratio(LEARNERS, case, base) for case in others]
+def learners_over_one() -> Ratio | None:
+    """Steps/s of two GPUs over one, each transition drawn as often."""
+    base, *_, as_often = (one.name for one in SUITES[LEARNERS])
+    return ratio(LEARNERS, as_often, base)
 
 
 def _drawn(case: str) -> Figure | None:

@@ -55,7 +55,7 @@ def claims() -> list[str]:
         mps={task: bounds([mps_over_share(task, n) for n in GMIS]) for task in SERVED},
         from_512=_more_environments(512, 2048),
         from_2048=_more_environments(2048, 8192),
-        learners=bounds(learners_over_one()),
+        learners=shown(learners_over_one()),
         nodes=two_nodes_over_one(),
         reward=", ".join(f"{task} {shown(seconds_over_one_process(task))}" for task in REWARD),
         **_reductions(),

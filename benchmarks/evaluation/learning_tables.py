@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from benchmarks.cases import REWARD, TASKS
@@ -21,8 +21,8 @@ from benchmarks.evaluation.figures import (
 )
 from benchmarks.evaluation.seed_tables import of_algorithms
 from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
-from benchmarks.outcomes import seconds_to
-from benchmarks.records import RESULTS, Call, calls_by_date
+from benchmarks.outcomes import Curve, seconds_to
+from benchmarks.records import Call, calls_by_date
 from benchmarks.walking import OURS, SCRIPT
 
 NEARLY = 0.9
@@ -38,37 +38,6 @@ MARKS = (
 """Task, return, what Isaac Gym publishes for it on an A100 (arXiv:2108.10470); files and cases."""
 
 
-def _learnt() -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    for path in sorted(RESULTS.glob("learn-*.json")):
-        for name, case in results_of(path.stem)["cases"].items():
-            if any("summary" in run for run in case["runs"]):
-                yield path.stem, name, case
-
-
-@table(
-    "learning",
-    "case | MJX | million steps: | seconds alone on a GPU: | return of every run "
-    "| metrics, least to most | file",
-    more=lambda: dict.fromkeys(file for file, *_ in _learnt()),
-)
-def learning() -> Rows:
-    """What every task reached over its seeds, and how long that took alone on a GPU."""
-    for file, name, case in _learnt():
-        runs = [run for run in case["runs"] if "summary" in run]
-        steps = bounds([run["summary"]["env_steps"] / 1e6 for run in runs], ".0f")
-        alone = [run["summary"]["train_wall_s"] for run in runs if "together" not in run]
-        returns = ", ".join(shown(run["summary"]["final_return"], ",.0f") for run in runs)
-        impl = runs[0]["summary"].get("impl", "")
-        seconds = shown(figure(alone), ".0f")
-        yield [name, impl, steps, seconds, returns, ", ".join(_metrics(runs)), f"`{file}`"]
-
-
-def _metrics(runs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    for name in runs[0].get("metrics", ()):
-        values = [run["metrics"][name] for run in runs]
-        yield f"{name.removeprefix('metric/')} {bounds(values, '.3g')}"
-
-
 @table(
     "marks",
     "task | return: | runs that reached it: | seconds, here: | Isaac Gym, on an A100:",
@@ -77,7 +46,7 @@ def _metrics(runs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 def marks() -> Rows:
     """Seconds from the first report of a run alone on its GPU to a return that others publish."""
     for task, mark, published, runs in MARKS:
-        found = _times_to(mark, *_first(runs))
+        found = times_to(mark, *_first(runs))
         reached = [seconds for seconds in found if seconds is not None]
         share = f"{len(reached)} of {len(found)}"
         yield [task, f"{mark:,}", share, shown(figure(reached), ".1f"), published]
@@ -87,7 +56,7 @@ def seconds_to_mark(task: str) -> Figure | None:
     """Seconds of training until a task reaches the return that Isaac Gym's authors give."""
     ((mark, runs),) = ((mark, runs) for name, mark, _, runs in MARKS if name == task)
     file, case = _first(runs)
-    times = [s for s in _times_to(mark, file, case) if s is not None]
+    times = [s for s in times_to(mark, file, case) if s is not None]
     return figure(times, *sources_of(file))
 
 
@@ -96,7 +65,7 @@ def _first(runs: Sequence[tuple[str, str]]) -> tuple[str, str]:
     return next((one for one in runs if rate(*one)), runs[-1])
 
 
-def _times_to(mark: float, file: str, case: str) -> list[float | None]:
+def times_to(mark: float, file: str, case: str) -> list[float | None]:
     """Of every run that was alone on its GPU; None of one that did not get there."""
     runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
     curves = [run["curve"] for run in runs if "curve" in run and "together" not in run]
@@ -115,7 +84,7 @@ def _seconds_alike(task: str) -> tuple[float | None, list[Figure | None]]:
     if (final := rate("reward", one, "final_return")) is None:
         return None, [None, None]
     mark = NEARLY * final.median
-    seconds = (_times_to(mark, "reward", case) for case in (one, four))
+    seconds = (times_to(mark, "reward", case) for case in (one, four))
     reached = ([s for s in found if s is not None] for found in seconds)
     return mark, [figure(found, *sources_of("reward")) for found in reached]
 
@@ -150,8 +119,8 @@ def _of_algorithms() -> Calls:
 
 @table_of_calls(
     "returns",
-    "task | trained by | million steps: | successes: | return at the end: | mark: | "
-    "seeds that reach it: | seconds of training to it:",
+    "task | trained by | million steps: | successes: | return at the end: | after equal steps: | "
+    "after equal seconds: | mark: | seeds that reach it: | seconds of training to it:",
     _of_algorithms,
 )
 def returns(calls: Calls) -> Rows:
@@ -159,25 +128,50 @@ def returns(calls: Calls) -> Rows:
     for task, (call, _) in sorted(calls.items()):
         rows = call.results["rows"]
         mark = NEARLY * rows[0]["return"][1] if rows and rows[0]["return"] else None
+        ends = [curve[-1] for row in rows for curve in _curves(row)]
+        # What every run has: the least steps, and the least seconds.
+        equal_steps = min((steps for steps, *_ in ends), default=0)
+        equal_s = min((_trained_s(curve) for row in rows for curve in _curves(row)), default=0.0)
         for row in rows:
-            yield _beside(task, row, mark)
+            yield _beside(task, row, mark, equal_steps, equal_s)
 
 
-def _beside(task: str, row: Mapping[str, Any], mark: float | None) -> list[str]:
+def _curves(row: Mapping[str, Any]) -> list[Curve]:
+    """Of its seeds, also of those that were stopped."""
+    return [one["curve"] for one in (*row["each"], *row["cut"]) if one["curve"]]
+
+
+def _trained_s(curve: Curve) -> float:
+    """From its first line to its last one."""
+    return curve[-1][1] - curve[0][1]
+
+
+def _beside(
+    task: str, row: Mapping[str, Any], mark: float | None, equal_steps: int, equal_s: float
+) -> list[str]:
     """Cells of an algorithm: what its seeds reach, and how many of them the mark, and when.
 
     Seeds that were stopped count as they were then.
     """
     runs, seeds = [*row["each"], *row["cut"]], row["seeds"] + row["unfinished"]
-    curves = [one["curve"] for one in runs if one["curve"]]
+    curves = _curves(row)
     finals = [one["final_return"] for one in runs if one["final_return"] is not None]
+    by_steps = [_last_return(c, lambda steps, _: steps <= equal_steps) for c in curves]
+    by_seconds = [_last_return(c, lambda _, seconds: seconds <= equal_s) for c in curves]
     times = [] if mark is None else [seconds_to(mark, curve) for curve in curves]
     reached = [s for s in times if s is not None]
+    returns = (figure([r for r in one if r is not None]) for one in (finals, by_steps, by_seconds))
     return [
         *(f"`{task}`", row["row"], bounds([curve[-1][0] / 1e6 for curve in curves], ".0f")),
-        *(f"{row['successes']} of {seeds}", shown(figure(finals), ",.4g"), shown(mark, ",.4g")),
-        *(f"{len(reached)} of {seeds}", shown(figure(reached), ".0f")),
+        *(f"{row['successes']} of {seeds}", *(shown(one, ",.4g") for one in returns)),
+        *(shown(mark, ",.4g"), f"{len(reached)} of {seeds}", shown(figure(reached), ".0f")),
     ]
+
+
+def _last_return(curve: Curve, counts: Callable[[int, float], bool]) -> float | None:
+    """The last one whose steps, and seconds from the first line, count."""
+    found = [r for steps, at, r in curve if r is not None and counts(steps, at - curve[0][1])]
+    return found[-1] if found else None
 
 
 @table(

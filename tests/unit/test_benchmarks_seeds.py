@@ -67,11 +67,11 @@ def test_a_row_is_one_line_for_people():
 def test_algorithms_stand_beside_the_first_whose_returns_are_the_mark(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    def row(name: str, overrides: list[str], *finals: float) -> dict[str, Any]:
+    def row(name: str, overrides: list[str], more: float, *finals: float) -> dict[str, Any]:
         each = [
             {
                 "final_return": final,
-                "curve": [[0, 1.0, None], [2e6, 11.0, final / 2], [4e6, 21.0, final]],
+                "curve": [[0, 1.0, None], [2e6, 11.0, final / 2], [2e6 + more, 21.0, final]],
             }
             for final in finals
         ]
@@ -83,13 +83,16 @@ def test_algorithms_stand_beside_the_first_whose_returns_are_the_mark(
             "return": [1.0, 100.0, 200.0],
         }
 
-    rows = [row("PPO", [], 80.0, 120.0), row("SAC", ["algo=sac"], 200.0, 50.0, 89.0)]
+    rows = [row("PPO", [], 2e6, 80.0, 120.0), row("SAC", ["algo=sac"], 1e6, 200.0, 50.0, 89.0)]
     calls = [{"date": "2026-11-28", "results": {"task": "ant", "rows": rows}}]
     path = tmp_path / "seeds-ant-nvidia-h200.json"
     path.write_text(json.dumps({"format": 2, "calls": calls}))
     monkeypatch.setattr(records, "RESULTS", tmp_path)
     ppo, sac = TABLES["returns"]()[2:4]
-    # Nine tenths of 100: one of PPO's gets there at its end, one of SAC's at half of it.
-    assert ppo == "| `ant` | PPO | 4 | 2 of 2 | 100 (80 to 120, n=2) | 90 | 1 of 2 | 20 |"
-    assert sac == "| `ant` | SAC | 4 | 2 of 3 | 89 (50 to 200, n=3) | 90 | 1 of 3 | 10 |"
+    # Nine tenths of 100: one of PPO's gets there at its end, one of SAC's at half of it. Within
+    # the 3M steps of SAC's, PPO's have half their returns; they take as many seconds.
+    ppo_returns = "100 (80 to 120, n=2) | 50 (40 to 60, n=2) | 100 (80 to 120, n=2)"
+    assert ppo == f"| `ant` | PPO | 4 | 2 of 2 | {ppo_returns} | 90 | 1 of 2 | 20 |"
+    sac_returns = " | ".join(["89 (50 to 200, n=3)"] * 3)
+    assert sac == f"| `ant` | SAC | 3 | 2 of 3 | {sac_returns} | 90 | 1 of 3 | 10 |"
     assert TABLES["seeds"]() == ["not measured"]
