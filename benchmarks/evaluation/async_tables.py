@@ -15,6 +15,7 @@ from benchmarks.evaluation.figures import (
     over,
     rate,
     ratio,
+    ratio_at,
     results_of,
     shown,
     sources_of,
@@ -110,10 +111,10 @@ def over_synchronous(case: Case, key: str = TRAINING) -> Ratio | None:
     return ratio(LONG, case.name, base, key)
 
 
-def asynchronous_gains(gpus: int) -> list[Ratio | None]:
+def asynchronous_gains(gpus: int, key: str) -> list[Ratio | None]:
     """Of every asynchronous case of `LONG` on so many GPUs."""
     cases = [one for one in SUITES[LONG] if one.gpus == gpus and "synchronous" not in one.name]
-    return [over_synchronous(case) for case in cases]
+    return [over_synchronous(case, key) for case in cases]
 
 
 @table(
@@ -129,6 +130,13 @@ def channels() -> Rows:
         pairs = CHANNELS.get((task, gpus), ())
         paper = " / ".join(f"{multi / uni:.2f}" for uni, multi in pairs)
         yield [f"`{task}`", str(gpus), *map(shown, found), paper]
+
+
+def beside_a_learner() -> list[Ratio | None]:
+    """Steps/s of SAC in an agent and a learner over one program, two updates for each step."""
+    ways = (f"2 updates, {way}/{TRAINING}" for way in ("agent + learner", "one program"))
+    reference = " over ".join(ways)
+    return [ratio_at(f"sac-{task}.json#{reference}") for task in ("ant", "humanoid", "go1")]
 
 
 def _task_and_size(call: Call) -> tuple[str, str | None, tuple[int, ...]]:

@@ -1,6 +1,6 @@
 """What a figure is of: how many runs, and files of results whose commit and date are known or not.
 
-A figure keeps it (`figures.Figure`), and so does a ratio of figures and what a table of words says.
+Figures keep it (`figures.Figure`), and so do their ratios and what a table of words says.
 """
 
 from __future__ import annotations

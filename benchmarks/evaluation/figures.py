@@ -184,6 +184,17 @@ def look_up_all(reference: str) -> tuple[Call, list[list[float]]]:
     raise ConfigError(f"{file} has no {rest}")
 
 
+def ratio_at(reference: str) -> Ratio | None:
+    """The value of `FILE.json#PATH over PATH`; None if no call has it."""
+    try:
+        call, values = look_up_all(reference)
+    except ConfigError:
+        return None
+    made_by = source(reference.partition(".json")[0], call)
+    one, base = (figure(found, made_by) for found in values)
+    return over(one, base)
+
+
 def _at(node: Any, path: str) -> Iterator[float]:
     if not path:
         if isinstance(node, int | float):

@@ -73,7 +73,7 @@ def times_to(mark: float, file: str, case: str) -> list[float | None]:
 
 
 def _gmis(task: str) -> tuple[str, str]:
-    """The cases of figure 10: in one process, and in four GMIs."""
+    """The cases of figure 9: in one process, and in four GMIs."""
     one, four = (f"{task} {gmis} x {8192 // gmis}" for gmis in (1, 4))
     return one, four
 

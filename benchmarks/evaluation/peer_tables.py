@@ -53,6 +53,14 @@ def over_brax() -> list[Ratio]:
     return [one for one in found if one is not None]
 
 
+def our_rate(comparison: str) -> Figure | None:
+    """Our steps/s in a comparison."""
+    if comparison not in (found := measured()):
+        return None
+    call, path = found[comparison]
+    return _both(call.results, comparison, "steps_per_s", source(path.stem, call))[0]
+
+
 def _ratio(results: Mapping[str, Any], comparison: str, *sources: Source) -> Ratio | None:
     return over(*_both(results, comparison, "steps_per_s", *sources))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from benchmarks.evaluation.evidence import Ratio, Source, source
@@ -12,6 +13,8 @@ from benchmarks.records import Call, calls_by_date
 
 PATTERN = "sweeps-nvidia-*.json"
 ONE_AFTER_ANOTHER = "1 at once, auto"
+STEPS, FINISHED = "steady_steps_per_s", "trainings_per_hour"
+KEYS = MappingProxyType({"steps": STEPS, "finished": FINISHED})
 HEAD = (
     "at once | sweeps: | runs per hour: | over one after another: | over plain sharing: | "
     "steps/s in all:"
@@ -34,17 +37,17 @@ class SameJobs(NamedTuple):
     runs: list[tuple[int, str, Run]]
     sources: list[Source]
 
-    def rates(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
+    def rates(self, key: str = FINISHED) -> dict[str, Figure]:
         """A figure of all sweeps, by way."""
         return _figures(((way, run[key]) for _, way, run in self.runs), self.sources)
 
-    def gains(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
+    def gains(self, key: str = FINISHED) -> dict[str, Figure]:
         """A figure over that of one after another, each ratio of one call."""
         return self._ratios(lambda way: ONE_AFTER_ANOTHER, key)
 
     def gains_over_sharing(self) -> dict[str, Figure]:
         """Jobs per hour over those of as many at once under plain sharing."""
-        return self._ratios(lambda way: way.replace(", auto", ", share"), "trainings_per_hour")
+        return self._ratios(lambda way: way.replace(", auto", ", share"), FINISHED)
 
     def _ratios(self, base_of: Callable[[str], str], key: str) -> dict[str, Figure]:
         rates = (((number, way), run[key]) for number, way, run in self.runs)
@@ -83,20 +86,21 @@ def same_jobs() -> dict[str, SameJobs]:
     return found
 
 
-def first_gains(key: str = "trainings_per_hour") -> dict[str, Figure]:
-    """What the jobs of the first call gain at once, over one after another."""
-    return next((same.gains(key) for same in same_jobs().values()), {})
+def eight_at_once(key: str) -> Figure | None:
+    """What eight of the jobs of the first call gain at once, over one after another."""
+    gains = next((same.gains(key) for same in same_jobs().values()), {})
+    return gains.get("8 at once, auto")
 
 
-def program_over_processes(key: str = "trainings_per_hour") -> Ratio | None:
-    """Eight jobs as one program, over the same jobs in eight processes.
+def processes_over_program(key: str) -> Ratio | None:
+    """Eight jobs in eight processes, over the same jobs as one program.
 
     Of the jobs that were measured most often so, the newest.
     """
     best = None
     for same in same_jobs().values():
         rates = same.rates(key)
-        gain = over(rates.get("8 at once, vmap"), rates.get("8 at once, auto"))
+        gain = over(rates.get("8 at once, auto"), rates.get("8 at once, vmap"))
         if gain and (best is None or gain.evidence.repeats >= best.evidence.repeats):
             best = gain
     return best
@@ -108,7 +112,7 @@ def sweeps() -> list[str]:
     found: list[str] = []
     for what, same in same_jobs().items():
         gains, sharing = same.gains(), same.gains_over_sharing()
-        steps = same.rates("steady_steps_per_s")
+        steps = same.rates(STEPS)
         rows = [
             [
                 way,

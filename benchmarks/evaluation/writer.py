@@ -111,7 +111,12 @@ def words(name: str) -> Callable[[MakeValues], MakeValues]:
 
     def register(make: MakeValues) -> MakeValues:
         template = Path(__file__).parent / f"{name}.md"
-        SAID[name] = lambda: [_filled(one, make()) for one in template.read_text().splitlines()]
+
+        def said() -> list[tuple[str, Evidence | None]]:
+            values = make()
+            return [_filled(line, values) for line in template.read_text().splitlines()]
+
+        SAID[name] = said
         TABLES[name] = lambda: [line for line, _ in SAID[name]()]
         return make
 
