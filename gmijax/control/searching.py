@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
+
 from gmijax.autotune.tuner import Search, SearchResult, is_auto, workload_of
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
@@ -11,13 +14,19 @@ from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import create_run, write_json
 
+_FOUND = ("num_envs", "plan.gmis_per_gpu", "physics.impl")
+"""What a search answers."""
 
-def search(config: TrainConfig, *, show: Show = False) -> SearchResult:
+
+def search(
+    config: TrainConfig, *, show: Show = False, overrides: Sequence[str] = ()
+) -> SearchResult:
     """Finds environments per GMI and GMIs per GPU for a training job, where they are `auto`.
 
     Args:
       config: see `gmijax.compose(..., command="search")`; its `search` says how.
       show: print progress, a table and the answer.
+      overrides: `key=value` from which `config` was made, for the command that is printed last.
 
     Raises:
       ConfigError: bad input, before anything was started, or a budget too small for one profile.
@@ -43,14 +52,18 @@ def search(config: TrainConfig, *, show: Show = False) -> SearchResult:
     console.print(f"run folder: {nearby(started.run.root)}")
     result = started.result()
     if not result.trainers and result.split is None:
-        print_next(console, ("train with these numbers", _training(config, result)))
+        print_next(console, ("train with these numbers", _training(config, overrides, result)))
     return result
 
 
-def _training(config: TrainConfig, result: SearchResult) -> str:
+def _training(config: TrainConfig, overrides: Sequence[str], result: SearchResult) -> str:
     """The command that trains with what was found, beside what else was given."""
-    gpus = "" if config.plan.gpus == 1 else f" plan.gpus={config.plan.num_gpus}"
-    return (
-        f"gmijax train {config.env.words} num_envs={result.num_envs} "
-        f"plan.gmis_per_gpu={result.gmis_per_gpu} physics.impl={result.impl}{gpus}"
-    )
+    found = (result.num_envs, result.gmis_per_gpu, result.impl)
+    given = overrides or (config.env.words, f"algo={config.algo.name}")
+    others = [
+        word
+        for word in given
+        if not word.startswith((*_FOUND, "search.", "run.dir=", "run.name="))
+    ]
+    answers = [f"{key}={value}" for key, value in zip(_FOUND, found, strict=True)]
+    return shlex.join(["gmijax", "train", *others, *answers])

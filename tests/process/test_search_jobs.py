@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,11 @@ def search(*overrides: str, cwd: Path) -> dict[str, Any]:
     report = json.loads((cwd / "s" / "search.json").read_text())
     assert report["complete"]
     assert report["reason"] in done.stdout
+    if "serving_gpus" not in (best := report["best"]):
+        words = shlex.split(done.stdout.rpartition("\n  ")[2])
+        given = [word for word in overrides if not word.startswith("search.")]
+        assert words[:-3] == ["gmijax", "train", *given]
+        assert words[-3] == f"num_envs={best['num_envs']}"
     for run in (cwd / "s" / "profiles").iterdir():
         assert pids_of(run) == []
         assert not (run / "checkpoints").exists()
