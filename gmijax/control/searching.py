@@ -14,9 +14,6 @@ from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import create_run, write_json
 
-_FOUND = ("num_envs", "plan.gmis_per_gpu", "physics.impl")
-"""What a search answers."""
-
 
 def search(
     config: TrainConfig, *, show: Show = False, overrides: Sequence[str] = ()
@@ -51,19 +48,22 @@ def search(
     write_json(started.run.config, to_dict(config))
     console.print(f"run folder: {nearby(started.run.root)}")
     result = started.result()
-    if not result.trainers and result.split is None:
-        print_next(console, ("train with these numbers", _training(config, overrides, result)))
+    print_next(console, ("train with these numbers", _training(config, overrides, result)))
     return result
 
 
 def _training(config: TrainConfig, overrides: Sequence[str], result: SearchResult) -> str:
     """The command that trains with what was found, beside what else was given."""
-    found = (result.num_envs, result.gmis_per_gpu, result.impl)
     given = overrides or (config.env.words, f"algo={config.algo.name}")
-    others = [
-        word
-        for word in given
-        if not word.startswith((*_FOUND, "search.", "run.dir=", "run.name="))
-    ]
-    answers = [f"{key}={value}" for key, value in zip(_FOUND, found, strict=True)]
+    left_out = ["run.dir=", "run.name=", "num_envs=", "plan.gmis_per_gpu="]
+    if result.trainers or result.split is not None:
+        # The job finds how GMIs and GPUs are divided where the search has left it.
+        answers = ["num_envs=auto", "plan.gmis_per_gpu=auto"]
+    else:
+        left_out += ["search.", "physics.impl="]
+        answers = [
+            *(f"num_envs={result.num_envs}", f"plan.gmis_per_gpu={result.gmis_per_gpu}"),
+            f"physics.impl={result.impl}",
+        ]
+    others = [word for word in given if not word.startswith(tuple(left_out))]
     return shlex.join(["gmijax", "train", *others, *answers])
