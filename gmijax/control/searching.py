@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
+
 from gmijax.autotune.tuner import Search, SearchResult, is_auto, workload_of
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
@@ -12,12 +15,15 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import create_run, write_json
 
 
-def search(config: TrainConfig, *, show: Show = False) -> SearchResult:
+def search(
+    config: TrainConfig, *, show: Show = False, overrides: Sequence[str] = ()
+) -> SearchResult:
     """Finds environments per GMI and GMIs per GPU for a training job, where they are `auto`.
 
     Args:
       config: see `gmijax.compose(..., command="search")`; its `search` says how.
       show: print progress, a table and the answer.
+      overrides: `key=value` from which `config` was made, for the command that is printed last.
 
     Raises:
       ConfigError: bad input, before anything was started, or a budget too small for one profile.
@@ -42,15 +48,22 @@ def search(config: TrainConfig, *, show: Show = False) -> SearchResult:
     write_json(started.run.config, to_dict(config))
     console.print(f"run folder: {nearby(started.run.root)}")
     result = started.result()
-    if not result.trainers and result.split is None:
-        print_next(console, ("train with these numbers", _training(config, result)))
+    print_next(console, ("train with these numbers", _training(config, overrides, result)))
     return result
 
 
-def _training(config: TrainConfig, result: SearchResult) -> str:
+def _training(config: TrainConfig, overrides: Sequence[str], result: SearchResult) -> str:
     """The command that trains with what was found, beside what else was given."""
-    gpus = "" if config.plan.gpus == 1 else f" plan.gpus={config.plan.num_gpus}"
-    return (
-        f"gmijax train {config.env.words} num_envs={result.num_envs} "
-        f"plan.gmis_per_gpu={result.gmis_per_gpu} physics.impl={result.impl}{gpus}"
-    )
+    given = overrides or (config.env.words, f"algo={config.algo.name}")
+    left_out = ["run.dir=", "run.name=", "num_envs=", "plan.gmis_per_gpu="]
+    if result.trainers or result.split is not None:
+        # The job finds how GMIs and GPUs are divided where the search has left it.
+        answers = ["num_envs=auto", "plan.gmis_per_gpu=auto"]
+    else:
+        left_out += ["search.", "physics.impl="]
+        answers = [
+            *(f"num_envs={result.num_envs}", f"plan.gmis_per_gpu={result.gmis_per_gpu}"),
+            f"physics.impl={result.impl}",
+        ]
+    others = [word for word in given if not word.startswith(tuple(left_out))]
+    return shlex.join(["gmijax", "train", *others, *answers])

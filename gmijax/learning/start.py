@@ -205,17 +205,21 @@ def begin_episodes(
     step_bytes += jnp.dtype(jnp.float32).itemsize  # The reward.
     env_bytes = num_runs * sum(leaf.size * leaf.dtype.itemsize for leaf in state)
     all_step_bytes = num_runs * num_envs * step_bytes
-    least_bytes = env_bytes + kept_steps * all_step_bytes
     limit_bytes = _memory_bytes()
-    if limit_bytes is not None and least_bytes > limit_bytes:
-        need, have = (f"{num_bytes / 2**30:.3g} GiB" for num_bytes in (least_bytes, limit_bytes))
+    if (
+        limit_bytes is not None
+        and (least := env_bytes + kept_steps * all_step_bytes) > limit_bytes
+    ):
+        need, have = (f"{num_bytes / 2**30:.3g} GiB" for num_bytes in (least, limit_bytes))
         them = "them" if num_runs == 1 else f"those of {num_runs} runs"
         most_steps = int((limit_bytes - env_bytes) / all_step_bytes)
-        fewer = f"{kept_key} up to {most_steps}, or " if most_steps > 0 else ""
+        most_envs = int(limit_bytes * num_envs / least)
+        fits = [f"{kept_key} up to {most_steps}"] * (most_steps > 0)
+        fits += [f"num_envs less than {most_envs}"] * (most_envs > 1)
         raise ConfigError(
             f"num_envs={num_envs}: a GMI would need more than {need} for {them} and {kept_steps} "
-            f"steps of each ({kept_key}), and has {have}; allowed are {fewer}num_envs less than "
-            f"{int(limit_bytes * num_envs / least_bytes)}"
+            f"steps of each ({kept_key}), and has {have}; allowed are "
+            f"{', or '.join(fits) or f'less of both num_envs and {kept_key}'}"
         )
     starts = env_keys(key, first_env, num_envs)
     return compile_once(init.lower(env.model, starts))(env.model, starts)

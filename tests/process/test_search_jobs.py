@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,12 @@ def search(*overrides: str, cwd: Path) -> dict[str, Any]:
     report = json.loads((cwd / "s" / "search.json").read_text())
     assert report["complete"]
     assert report["reason"] in done.stdout
+    words = shlex.split(done.stdout.rpartition("\n  ")[2])
+    best, given, num_envs = report["best"], list(overrides), "auto"
+    if "serving_gpus" not in best:
+        given, num_envs = [w for w in given if not w.startswith("search.")], best["num_envs"]
+    expected = ["gmijax", "train", *given, f"num_envs={num_envs}"]
+    assert words[: len(expected)] == expected
     for run in (cwd / "s" / "profiles").iterdir():
         assert pids_of(run) == []
         assert not (run / "checkpoints").exists()

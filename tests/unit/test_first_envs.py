@@ -49,6 +49,10 @@ def test_what_fits_is_told_and_is_taken(monkeypatch: pytest.MonkeyPatch):
         begin(most - 1, kept_steps=8)
     with pytest.raises(ConfigError, match="for those of 2 runs and 4 steps of each"):
         start.begin_episodes(ENV, KEY, 7, most - 1, kept_steps=4, num_runs=2)
+    with pytest.raises(ConfigError, match=r"allowed are unroll_length up to \d+$"):
+        begin(8, kept_steps=10**9)  # Not even one environment could have so many.
+    with pytest.raises(ConfigError, match="allowed are less of both num_envs and unroll_length"):
+        begin(10**6, kept_steps=10**9)
     monkeypatch.setattr(start, "detect_host", HostLimits)  # Unknown.
     begin(most + 1)
 
