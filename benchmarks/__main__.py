@@ -36,7 +36,8 @@ def main() -> int:
 
 def _checked() -> int:
     found = check.check()
-    sys.stdout.writelines(f"{finding}\n" for finding in (*found, check.count()))
+    excused = f"lines that are excused by '{check.NO_FIGURE}': {check.excused()}"
+    sys.stdout.writelines(f"{one}\n" for one in (*found, check.count(), excused))
     return int(bool(found))
 
 

@@ -29,7 +29,7 @@ def _case(name: str, overrides: str, gpus: int = 1) -> Case:
 
 TASKS = ("ant", "anymal", "ball_balance", "franka_cabinet", "humanoid", "shadow_hand")
 REWARD = ("ant", "anymal", "humanoid")
-"""Tasks of the paper's figure 10."""
+"""Tasks of the paper's figure 9."""
 
 PLANS = ((1, 65536), (4, 16384), (2, 32768))
 """GMIs on one GPU and environments in each, where it is near saturation."""
@@ -190,7 +190,7 @@ SUITES = MappingProxyType(
             )
             for impl in ("jax", "warp")
         },
-        # Figure 10.
+        # Figure 9.
         "reward": tuple(_reward(task, gmis) for task in REWARD for gmis in (1, 4)),
         **{f"lgr-{task}": _lgr(task) for task in ("ant", "humanoid", "shadow_hand")},
         "scaling": (

@@ -69,19 +69,19 @@ def dominant_resource(
 
 
 def tdg_resource(simulator: Task, agent: Task, alpha: float) -> float:
-    """Table 3, TDG: (T_s R_s + T_a alpha R_a) / (T_s + T_a)."""
+    """Table 4, TDG: (T_s R_s + T_a alpha R_a) / (T_s + T_a)."""
     return tdg_ex_resource(simulator, agent, NOTHING, alpha, 0.0)
 
 
 def tcg_resource(simulator: Task, agent: Task) -> float:
-    """Table 3, TCG: (T_s + T_a) max(R_s, R_a) / (T_s + T_a)."""
+    """Table 4, TCG: (T_s + T_a) max(R_s, R_a) / (T_s + T_a)."""
     return max(simulator.resource, agent.resource)
 
 
 def tdg_ex_resource(
     simulator: Task, agent: Task, trainer: Task, alpha: float, beta: float
 ) -> float:
-    """Table 4, TDG_EX: (T_s R_s + T_a alpha R_a + T_t beta R_t) / (T_s + T_a + T_t).
+    """Table 5, TDG_EX: (T_s R_s + T_a alpha R_a + T_t beta R_t) / (T_s + T_a + T_t).
 
     Raises:
       ConfigError: the tasks take no time at all.
@@ -96,23 +96,23 @@ def tdg_ex_resource(
 
 
 def tcg_ex_resource(simulator: Task, agent: Task, trainer: Task) -> float:
-    """Table 4, TCG_EX: (T_s + T_a + T_t) max(R_s, R_a, R_t) / (T_s + T_a + T_t)."""
+    """Table 5, TCG_EX: (T_s + T_a + T_t) max(R_s, R_a, R_t) / (T_s + T_a + T_t)."""
     return max(simulator.resource, agent.resource, trainer.resource)
 
 
 def tdg_bytes(sizes: Sizes) -> float:
-    """Table 3, COM of TDG: 2 S + A + W. That of TCG is 0."""
+    """Table 4, COM of TDG: 2 S + A + W. That of TCG is 0."""
     return 2 * sizes.state + sizes.action + sizes.reward
 
 
 def tdg_ex_bytes(sizes: Sizes, steps: int, num_gmis: int) -> float:
-    """Table 4, COM of TDG_EX: m (S + A + W) + M_p + 2 (n - 1) M_p / n."""
+    """Table 5, COM of TDG_EX: m (S + A + W) + M_p + 2 (n - 1) M_p / n."""
     experience = steps * (sizes.state + sizes.action + sizes.reward)
     return experience + sizes.parameters + tcg_ex_bytes(sizes, num_gmis)
 
 
 def tcg_ex_bytes(sizes: Sizes, num_gmis: int) -> float:
-    """Table 4, COM of TCG_EX: 2 (n - 1) M_p / n, the reduction of gradients."""
+    """Table 5, COM of TCG_EX: 2 (n - 1) M_p / n, the reduction of gradients."""
     return 2 * (num_gmis - 1) * sizes.parameters / num_gmis
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.cases import SUITES, Case
+from benchmarks.evaluation.evidence import Ratio
 from benchmarks.evaluation.figures import (
     TRAINING,
     WHOLE_RUN,
@@ -14,8 +15,10 @@ from benchmarks.evaluation.figures import (
     over,
     rate,
     ratio,
+    ratio_at,
     results_of,
     shown,
+    sources_of,
     summaries,
 )
 from benchmarks.evaluation.learning_tables import NEARLY, times_to
@@ -70,7 +73,7 @@ def several_learners() -> Rows:
         ]
 
 
-def learners_over_one() -> float | None:
+def learners_over_one() -> Ratio | None:
     """Steps/s of two GPUs over one, each transition drawn as often."""
     base, *_, as_often = (one.name for one in SUITES[LEARNERS])
     return ratio(LEARNERS, as_often, base)
@@ -83,7 +86,8 @@ def _drawn(case: str) -> Figure | None:
         return None
     algo = config["algo"]
     for_each_step = algo["updates_per_step"] * algo["batch_size"] / config["num_envs"]
-    return figure([for_each_step * one[TRAINING] for one in summaries(LEARNERS, case)])
+    drawn = [for_each_step * one[TRAINING] for one in summaries(LEARNERS, case)]
+    return figure(drawn, *sources_of(LEARNERS))
 
 
 @table(
@@ -101,16 +105,16 @@ def asynchronous_long() -> Rows:
         yield [case.name, cells[0], gains[0], cells[1], gains[1], cells[2]]
 
 
-def over_synchronous(case: Case, key: str = TRAINING) -> float | None:
+def over_synchronous(case: Case, key: str = TRAINING) -> Ratio | None:
     """A case of `LONG` over synchronous training on as many GPUs."""
     base = next(one.name for one in SUITES[LONG] if one.gpus == case.gpus)
     return ratio(LONG, case.name, base, key)
 
 
-def asynchronous_gains(gpus: int) -> list[float | None]:
+def asynchronous_gains(gpus: int, key: str) -> list[Ratio | None]:
     """Of every asynchronous case of `LONG` on so many GPUs."""
     cases = [one for one in SUITES[LONG] if one.gpus == gpus and "synchronous" not in one.name]
-    return [over_synchronous(case) for case in cases]
+    return [over_synchronous(case, key) for case in cases]
 
 
 @table(
@@ -126,6 +130,13 @@ def channels() -> Rows:
         pairs = CHANNELS.get((task, gpus), ())
         paper = " / ".join(f"{multi / uni:.2f}" for uni, multi in pairs)
         yield [f"`{task}`", str(gpus), *map(shown, found), paper]
+
+
+def beside_a_learner() -> list[Ratio | None]:
+    """Steps/s of SAC in an agent and a learner over one program, two updates for each step."""
+    ways = (f"2 updates, {way}/{TRAINING}" for way in ("agent + learner", "one program"))
+    reference = " over ".join(ways)
+    return [ratio_at(f"sac-{task}.json#{reference}") for task in ("ant", "humanoid", "go1")]
 
 
 def _task_and_size(call: Call) -> tuple[str, str | None, tuple[int, ...]]:

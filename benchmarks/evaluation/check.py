@@ -4,9 +4,9 @@ A figure in a text stands in a marker, `<!-- figure: FILE.json#PATH FORMAT -->1.
 (`figures.look_up` says what a path is; the format is Python's), and a table between
 `<!-- table: NAME -->` and `<!-- /table -->`. `fill` writes what belongs there. What looks like a
 measurement elsewhere is a finding, but for code and lines that end with `<!-- no figure -->`:
-limits, examples, and what others report. Figures of a decision are of its day: one that says "as
-measured then" may have some without a file. A file of results has the commit that it was measured
-with, or `benchmarks/plan.md` says how it will be measured again.
+limits, examples, and what others report; `excused` counts them. Figures of a decision are of its
+day: one that says "as measured then" may have some without a file. What few runs or no commit back
+is said beside it (`repeats`) and named in `benchmarks/plan.md` (`planned`).
 """
 
 from __future__ import annotations
@@ -15,19 +15,17 @@ import difflib
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 from benchmarks.evaluation.count import Count, of_figure, of_table
 from benchmarks.evaluation.figures import look_up
+from benchmarks.evaluation.finding import Finding
 from benchmarks.evaluation.page import TABLES
+from benchmarks.evaluation.planned import unplanned, without_commit
 from benchmarks.evaluation.plots import FOLDER, PICTURES, is_current
-from benchmarks.records import RESULTS, read_calls
+from benchmarks.evaluation.repeats import runs_said
 from gmijax.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
-PLAN = ROOT / "benchmarks" / "plan.md"
-OF_FILES = "| files |"
-"""Where the plan's table of files begins."""
 FIGURE = re.compile(r"(<!-- figure: ([^>]+?) (\S+) -->)(.*?)(<!-- /figure -->)")
 TABLE = re.compile(r"(<!-- table: (\S+) -->\n)(.*?)(<!-- /table -->)", re.DOTALL)
 NO_FIGURE = "<!-- no figure -->"
@@ -46,25 +44,6 @@ MEASUREMENTS = tuple(
     )
 )
 """What looks like a measurement: rates, large counts, ratios, parts, seconds to a mark."""
-
-
-class Finding(NamedTuple):
-    """A figure without a file, or one that differs from it.
-
-    Attributes:
-      file: the document.
-      line: in it.
-      text: what stands there.
-      said: what the file of results says.
-    """
-
-    file: str
-    line: int
-    text: str
-    said: str
-
-    def __str__(self) -> str:
-        return f"{self.file}:{self.line}: {self.text!r}: {self.said}"
 
 
 def documents(root: Path = ROOT) -> list[Path]:
@@ -90,7 +69,7 @@ def check(root: Path = ROOT) -> list[Finding]:
         if not is_current(name):
             path = (FOLDER / f"{name}.svg").relative_to(ROOT).as_posix()
             found.append(Finding(path, 1, name, "its numbers are not those of the files"))
-    return [*found, *without_commit()]
+    return [*found, *without_commit(), *unplanned()]
 
 
 def count(root: Path = ROOT) -> Count:
@@ -106,29 +85,9 @@ def count(root: Path = ROOT) -> Count:
     return total
 
 
-def without_commit(results: Path = RESULTS, plan: Path = PLAN) -> Iterator[Finding]:
-    """Files without a commit that the plan does not name, and the reverse."""
-    text = plan.read_text()
-    planned = {name: text.count("\n", 0, at) + 1 for name, at in _planned(text)}
-    for path in sorted(results.glob("*.json")):
-        has_commit = all(call.commit for call in read_calls(path))
-        if (line := planned.pop(path.stem, None)) is None and not has_commit:
-            yield Finding(
-                path.name, 1, path.stem, f"has no commit, and {plan.name} has no row of it"
-            )
-        elif line is not None and has_commit:
-            yield Finding(plan.name, line, path.stem, "has a commit: its row is done")
-    for name, line in planned.items():
-        yield Finding(plan.name, line, name, "there is no such file of results")
-
-
-def _planned(text: str) -> Iterator[tuple[str, int]]:
-    """Names of files in the first column of the first table, and where they stand."""
-    begin = text.index(OF_FILES)
-    end = text.find("\n## ", begin)
-    for row in re.finditer(r"^\|([^|]*)\|", text[begin:end], re.MULTILINE):
-        for name in re.finditer(r"`([^`]+)`", row[1]):
-            yield name[1], begin + row.start() + name.start()
+def excused(root: Path = ROOT) -> int:
+    """Lines that say that what looks like a measurement is none of ours."""
+    return sum(path.read_text().count(NO_FIGURE) for path in documents(root))
 
 
 def in_document(path: Path, root: Path = ROOT) -> Iterator[Finding]:
@@ -136,6 +95,8 @@ def in_document(path: Path, root: Path = ROOT) -> Iterator[Finding]:
     text, name = path.read_text(), path.relative_to(root).as_posix()
     for match in (*FIGURE.finditer(text), *TABLE.finditer(text)):
         yield from _compared(name, text, match)
+    if path.parent.name != "decisions":
+        yield from runs_said(name, text, FIGURE)
     if path.parent.name != "decisions" or OF_ITS_DAY not in text:
         yield from _unmarked(name, text)
 

@@ -9,16 +9,25 @@ from __future__ import annotations
 
 from benchmarks.cases import REWARD
 from benchmarks.evaluation.async_tables import KEYS, LONG, learners_over_one
-from benchmarks.evaluation.figures import NOT_MEASURED, bounds, ratio, results_of, shown
+from benchmarks.evaluation.evidence import Evidence, Ratio, Said, joined
+from benchmarks.evaluation.figures import (
+    TRAINING,
+    ratio,
+    results_of,
+    said,
+    said_bounds,
+    sources_of,
+)
 from benchmarks.evaluation.learning_tables import seconds_over_one_process
 from benchmarks.evaluation.node_tables import two_nodes_over_one
-from benchmarks.evaluation.other_tables import USE, answers, model_fit
+from benchmarks.evaluation.other_tables import USE, model_fit, searched
 from benchmarks.evaluation.paper import LGR, lgr_gain
+from benchmarks.evaluation.peer_tables import our_rate
 from benchmarks.evaluation.serving_tables import (
     GMIS,
     mps_over_one,
     mps_over_share,
-    serving_rate,
+    of_communication,
     templates_gains,
 )
 from benchmarks.evaluation.serving_tables import TASKS as SERVED
@@ -31,75 +40,78 @@ from benchmarks.evaluation.tables import (
     fixed_total_ratios,
     reduction_gain,
 )
-from benchmarks.evaluation.writer import filled, lines
+from benchmarks.evaluation.writer import Values, words
 
 
-@lines("claims")
-def claims() -> list[str]:
+@words("claims")
+def claims() -> Values:
     """What both versions of the paper claim, and what was measured here."""
-    uses = results_of(USE).get("tasks", {})
-    rates = [rate.median for n in GMIS if (rate := serving_rate("ant", n))]
-    return filled(
-        "claims",
-        busy=bounds([stage["sm"] for use in uses.values() for stage in use.values()], ".0%"),
-        busy_one=bounds(busy_in_jobs(several=False), ".0%"),
-        busy_several=bounds(busy_in_jobs(several=True), ".0%"),
-        model_fit=model_fit(),
-        serving_templates=bounds(templates_gains()),
-        templates=bounds([ratio(f"templates-{task}", *TEMPLATES) for task in ("ant", "humanoid")]),
-        answers=_answers(),
-        served=bounds(rates, ",.0f"),
-        served_over_one=bounds([mps_over_one(task, n) for task in SERVED for n in GMIS]),
-        fixed_total=bounds([*fixed_total_ratios().values()]),
-        best_plans=bounds([*best_plan_ratios().values()]),
-        mps={task: bounds([mps_over_share(task, n) for n in GMIS]) for task in SERVED},
-        from_512=_more_environments(512, 2048),
-        from_2048=_more_environments(2048, 8192),
-        learners=shown(learners_over_one()),
-        nodes=two_nodes_over_one(),
-        reward=", ".join(f"{task} {shown(seconds_over_one_process(task))}" for task in REWARD),
+    return {
+        "busy": _busy_stages(),
+        "busy_one": said_bounds(busy_in_jobs(several=False), ".0%"),
+        "busy_several": said_bounds(busy_in_jobs(several=True), ".0%"),
+        "model_fit": model_fit(),
+        "serving_templates": said_bounds(templates_gains()),
+        "com": said_bounds(of_communication()),
+        "templates": said_bounds([ratio(f"templates-{task}", *TEMPLATES) for task in SERVED]),
+        **searched(),
+        "served_over_one": said_bounds([mps_over_one(task, n) for task in SERVED for n in GMIS]),
+        "fixed_total": said_bounds([*fixed_total_ratios().values()]),
+        "best_plans": said_bounds([*best_plan_ratios().values()]),
+        "mps": {task: said_bounds([mps_over_share(task, n) for n in GMIS]) for task in SERVED},
+        "from_512": _more_environments(512, 2048),
+        "from_2048": _more_environments(2048, 8192),
+        "memory": _more_environments(2048, 8192, "device/peak_memory_mib"),
+        "learners": said(learners_over_one()),
+        "nodes": two_nodes_over_one(),
+        "reward": joined(", ", (_named(task, seconds_over_one_process(task)) for task in REWARD)),
+        "humanoid": said(our_rate("humanoid, MJX-Warp"), ",.0f"),
         **_reductions(),
         **_asynchronous(),
-    )
+    }
 
 
-def _answers() -> str:
-    """What the searches on one GPU chose."""
-    found = (
-        f"{task} {best['gmis_per_gpu']} x {best['num_envs']:,} ({best['impl']})"
-        for task, best in ((task, row["best"]) for task, row in answers().items())
-    )
-    return ", ".join(found) or NOT_MEASURED
+def _named(name: str, gain: Ratio | None) -> Said:
+    found = said(gain)
+    return Said(f"{name} {found}", found.evidence)
 
 
-def _more_environments(few: int, many: int) -> str:
-    """Steps/s with many environments in one process over those with few."""
-    return bounds(
+def _busy_stages() -> Said:
+    """SMs that the stages of one process keep busy, each measured once."""
+    uses = results_of(USE).get("tasks", {})
+    evidence = Evidence(1, frozenset(sources_of(USE)))
+    busy = [Ratio(stage["sm"], evidence) for use in uses.values() for stage in use.values()]
+    return said_bounds(busy, ".0%")
+
+
+def _more_environments(few: int, many: int, key: str = TRAINING) -> Said:
+    """Steps/s, or memory, with many environments in one process over those with few."""
+    return said_bounds(
         [
-            ratio(f"tasks-{impl}", f"{task} {impl} {many}", f"{task} {impl} {few}")
+            ratio(f"tasks-{impl}", f"{task} {impl} {many}", f"{task} {impl} {few}", key)
             for task in ("ant", "humanoid")
             for impl in ("jax", "warp")
         ]
     )
 
 
-def _reductions() -> dict[str, dict[str, str]]:
+def _reductions() -> dict[str, dict[str, Said]]:
     """Of LGR by task, on three layouts."""
-    found: dict[str, dict[str, str]] = {"lgr_of_paper": {}, "one_shot": {}, "lgr": {}}
+    found: dict[str, dict[str, Said]] = {"lgr_of_paper": {}, "one_shot": {}, "lgr": {}}
     for task in LGR:
         of_paper = [f"{lgr_gain(task, at):.2f}" for at in LAYOUTS]
-        one_shot = [shown(reduction_gain(task, at, "one_shot")) for at in LAYOUTS]
-        chosen = [
-            f"{way} {shown(reduction_gain(task, at, way))}"
+        one_shot = (said(reduction_gain(task, at, "one_shot")) for at in LAYOUTS)
+        chosen = (
+            _named(f"`{way}`", reduction_gain(task, at, way))
             for at, way in ((at, algorithm_1(at)) for at in LAYOUTS)
-        ]
-        found["lgr_of_paper"][task] = " ".join(of_paper)
-        found["one_shot"][task] = " ".join(one_shot)
-        found["lgr"][task] = ", ".join(chosen)
+        )
+        found["lgr_of_paper"][task] = Said(", ".join(of_paper), None)
+        found["one_shot"][task] = joined(", ", one_shot)
+        found["lgr"][task] = joined(", ", chosen)
     return found
 
 
-def _asynchronous() -> dict[str, dict[str, str]]:
+def _asynchronous() -> dict[str, dict[str, Said]]:
     """Of A3C with several GMIs over one on each GPU, and of channels, by key."""
     one_each, several = "3 + 1 GPUs, one process each", "3 + 1 GPUs, 4 agents + 2 trainers"
     pairs = {
@@ -109,4 +121,4 @@ def _asynchronous() -> dict[str, dict[str, str]]:
         "channels": ("async-channels", "anymal multi", "anymal uni"),
         "channels_fc": ("async-channels", "franka_cabinet multi", "franka_cabinet uni"),
     }
-    return {name: {key: shown(ratio(*pair, key)) for key in KEYS} for name, pair in pairs.items()}
+    return {name: {key: said(ratio(*pair, key)) for key in KEYS} for name, pair in pairs.items()}

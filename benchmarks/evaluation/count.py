@@ -13,10 +13,10 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+from benchmarks.evaluation.evidence import LEAST
 from benchmarks.evaluation.figures import look_up_all
 from gmijax.errors import ConfigError
 
-LEAST = 3
 SETTINGS = frozenset(
     (
         *("environments", "GPUs", "steps", "million steps", "call", "cap, %", "SMs", "kinds"),

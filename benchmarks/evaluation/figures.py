@@ -7,6 +7,7 @@ import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from benchmarks.evaluation.evidence import Evidence, Ratio, Said, Source, source, together
 from benchmarks.records import RESULTS, Call, read_calls
 from gmijax.errors import ConfigError
 
@@ -24,12 +25,19 @@ class Figure(NamedTuple):
       low: the smallest of them.
       high: the largest.
       repeats: how many there are.
+      sources: the calls that they are from.
     """
 
     median: float
     low: float
     high: float
     repeats: int
+    sources: frozenset[Source] = frozenset()
+
+    @property
+    def evidence(self) -> Evidence:
+        """What it is of."""
+        return Evidence(self.repeats, self.sources)
 
     def shown(self, form: str = ",.0f") -> str:
         """The median; with several repeats also from where to where they go."""
@@ -39,11 +47,12 @@ class Figure(NamedTuple):
         return f"{text} ({self.low:{form}} to {self.high:{form}}, n={self.repeats})"
 
 
-def figure(values: Sequence[float]) -> Figure | None:
+def figure(values: Sequence[float], *sources: Source) -> Figure | None:
     """The median of what was measured, None of nothing."""
     if not values:
         return None
-    return Figure(statistics.median(values), min(values), max(values), len(values))
+    found = statistics.median(values), min(values), max(values), len(values)
+    return Figure(*found, frozenset(sources))
 
 
 def call_of(file: str) -> Call | None:
@@ -63,6 +72,12 @@ def measured(files: Iterable[str]) -> list[str]:
     return [file for file in dict.fromkeys(files) if (RESULTS / f"{file}.json").exists()]
 
 
+def sources_of(file: str) -> list[Source]:
+    """That call; nothing without a file."""
+    call = call_of(file)
+    return [source(file, call)] if call else []
+
+
 def results_of(file: str) -> Mapping[str, Any]:
     """What that call measured; nothing without a file."""
     call = call_of(file)
@@ -71,7 +86,7 @@ def results_of(file: str) -> Mapping[str, Any]:
 
 def rate(file: str, case: str, key: str = TRAINING) -> Figure | None:
     """A figure of the summaries of a case of `<file>.json`; `key` is a path in them."""
-    return figure([*_at(results_of(file), f"{case}/{key}")])
+    return figure([*_at(results_of(file), f"{case}/{key}")], *sources_of(file))
 
 
 def summaries(file: str, case: str) -> list[Mapping[str, Any]]:
@@ -83,17 +98,21 @@ def summaries(file: str, case: str) -> list[Mapping[str, Any]]:
 def busy_sms(file: str, case: str) -> Figure | None:
     """Part of the SMs that were busy in the runs of a case, 0 to 1."""
     runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
-    return figure([run["busy_sms"] for run in runs if run.get("busy_sms") is not None])
+    values = [run["busy_sms"] for run in runs if run.get("busy_sms") is not None]
+    return figure(values, *sources_of(file))
 
 
-def ratio(file: str, case: str, base: str, key: str = TRAINING) -> float | None:
+def ratio(file: str, case: str, base: str, key: str = TRAINING) -> Ratio | None:
     """Median of `case` over that of `base`: of one call, so of one machine."""
     return over(rate(file, case, key), rate(file, base, key))
 
 
-def over(one: Figure | None, base: Figure | None) -> float | None:
+def over(one: Figure | None, base: Figure | None) -> Ratio | None:
     """Median over median, where both were measured."""
-    return one.median / base.median if one and base else None
+    if not one or not base:
+        return None
+    evidence = Evidence(min(one.repeats, base.repeats), one.sources | base.sources)
+    return Ratio(one.median / base.median, evidence)
 
 
 def shown(value: Figure | float | None, form: str = ".2f") -> str:
@@ -110,6 +129,18 @@ def bounds(values: Sequence[float | None], form: str = ".2f") -> str:
         return NOT_MEASURED
     low, high = format(min(found), form), format(max(found), form)
     return low if low == high else f"{low} to {high}"
+
+
+def said(value: Figure | Ratio | None, form: str = ".2f") -> Said:
+    """`shown`, with what it is of."""
+    return Said(shown(value, form), value.evidence if value is not None else None)
+
+
+def said_bounds(values: Sequence[Figure | Ratio | None], form: str = ".2f") -> Said:
+    """`bounds`, with what all of them are of."""
+    found = [value for value in values if value is not None]
+    medians = [value.median if isinstance(value, Figure) else value for value in found]
+    return Said(bounds(medians, form), together(value.evidence for value in found))
 
 
 def _count(results: Mapping[str, Any]) -> int:
@@ -151,6 +182,17 @@ def look_up_all(reference: str) -> tuple[Call, list[list[float]]]:
         if all(values):
             return call, values
     raise ConfigError(f"{file} has no {rest}")
+
+
+def ratio_at(reference: str) -> Ratio | None:
+    """The value of `FILE.json#PATH over PATH`; None if no call has it."""
+    try:
+        call, values = look_up_all(reference)
+    except ConfigError:
+        return None
+    made_by = source(reference.partition(".json")[0], call)
+    one, base = (figure(found, made_by) for found in values)
+    return over(one, base)
 
 
 def _at(node: Any, path: str) -> Iterator[float]:

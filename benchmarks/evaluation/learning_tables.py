@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from benchmarks.cases import REWARD, TASKS
+from benchmarks.evaluation.evidence import Ratio, source
 from benchmarks.evaluation.figures import (
     RATES,
     Figure,
@@ -16,6 +17,7 @@ from benchmarks.evaluation.figures import (
     rate,
     results_of,
     shown,
+    sources_of,
 )
 from benchmarks.evaluation.seed_tables import of_algorithms
 from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
@@ -53,7 +55,9 @@ def marks() -> Rows:
 def seconds_to_mark(task: str) -> Figure | None:
     """Seconds of training until a task reaches the return that Isaac Gym's authors give."""
     ((mark, runs),) = ((mark, runs) for name, mark, _, runs in MARKS if name == task)
-    return figure([s for s in times_to(mark, *_first(runs)) if s is not None])
+    file, case = _first(runs)
+    times = [s for s in times_to(mark, file, case) if s is not None]
+    return figure(times, *sources_of(file))
 
 
 def _first(runs: Sequence[tuple[str, str]]) -> tuple[str, str]:
@@ -69,7 +73,7 @@ def times_to(mark: float, file: str, case: str) -> list[float | None]:
 
 
 def _gmis(task: str) -> tuple[str, str]:
-    """The cases of figure 10: in one process, and in four GMIs."""
+    """The cases of figure 9: in one process, and in four GMIs."""
     one, four = (f"{task} {gmis} x {8192 // gmis}" for gmis in (1, 4))
     return one, four
 
@@ -81,10 +85,11 @@ def _seconds_alike(task: str) -> tuple[float | None, list[Figure | None]]:
         return None, [None, None]
     mark = NEARLY * final.median
     seconds = (times_to(mark, "reward", case) for case in (one, four))
-    return mark, [figure([s for s in found if s is not None]) for found in seconds]
+    reached = ([s for s in found if s is not None] for found in seconds)
+    return mark, [figure(found, *sources_of("reward")) for found in reached]
 
 
-def seconds_over_one_process(task: str) -> float | None:
+def seconds_over_one_process(task: str) -> Ratio | None:
     """Of four GMIs to the same return."""
     one, four = _seconds_alike(task)[1]
     return over(four, one)
@@ -216,12 +221,13 @@ def walking(calls: Calls) -> Rows:
 def seconds_until_it_walks(task: str) -> Figure | None:
     """Seconds of training by SAC in the newest call, compiled before; None if one fails."""
     calls = newest("walking-*-nvidia-*.json", _kind_of_walking)
-    for (of, algo, _, is_cold), (call, _) in calls.items():
+    for (of, algo, _, is_cold), (call, path) in calls.items():
         if (of, algo, is_cold) == (task, "SAC", False):
             row = call.results["rows"][OURS]
             if row["walk"] == row["seeds"]:
                 low, median, high = row["training_s"]
-                return Figure(median, low, high, row["walk"])
+                sources = frozenset([source(path.stem, call)])
+                return Figure(median, low, high, row["walk"], sources)
     return None
 
 

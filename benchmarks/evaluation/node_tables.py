@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
-from benchmarks.evaluation.figures import TRAINING, Figure, bounds, figure, over, shown
+from benchmarks.evaluation.evidence import Evidence, Ratio, Said, source
+from benchmarks.evaluation.figures import TRAINING, Figure, figure, over, said_bounds, shown
 from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
 from benchmarks.records import calls_by_date
 
@@ -46,7 +47,7 @@ def _rate(ways: Ways, way: str, key: str) -> Figure | None:
     return figure([value for value in values if value is not None])
 
 
-def over_one_node(ways: Ways, way: str, key: str = TRAINING) -> float | None:
+def over_one_node(ways: Ways, way: str, key: str = TRAINING) -> Ratio | None:
     """A rate of a way over that of one node, of one call."""
     return over(_rate(ways, way, key), _rate(ways, ONE_NODE, key))
 
@@ -112,11 +113,13 @@ def nodes(calls: Calls) -> Rows:
         yield from _rows(job, _by_job(call.results)[job])
 
 
-def two_nodes_over_one() -> dict[str, str]:
+def two_nodes_over_one() -> dict[str, Said]:
     """Steps/s of two nodes over those of one, by a key of `TWO_NODES`."""
-    found: dict[str, list[float | None]] = {}
-    for job, (call, _) in _newest().items():
-        ways = _by_job(call.results)[job]
+    found: dict[str, list[Ratio | None]] = {}
+    for job, (call, path) in _newest().items():
+        ways, sources = _by_job(call.results)[job], frozenset([source(path.stem, call)])
         for way in ways:
-            found.setdefault(way, []).append(over_one_node(ways, way))
-    return {key: bounds(found.get(way, ())) for key, way in TWO_NODES.items()}
+            if (gain := over_one_node(ways, way)) is not None:
+                of = Evidence(gain.evidence.repeats, sources)
+                found.setdefault(way, []).append(Ratio(gain, of))
+    return {key: said_bounds(found.get(way, ())) for key, way in TWO_NODES.items()}

@@ -6,12 +6,16 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from benchmarks.evaluation.evidence import Evidence, Ratio, Said, source
 from benchmarks.evaluation.figures import (
+    NOT_MEASURED,
     Figure,
     bounds,
     figure,
     results_of,
+    said_bounds,
     shown,
+    sources_of,
 )
 from benchmarks.evaluation.writer import (
     Calls,
@@ -42,6 +46,22 @@ def _searches() -> Calls:
         rows = call.results.get("rows") or [call.results]  # An old file is one search.
         found |= {row["env"]: (call, path) for row in rows if "best" in row}
     return found
+
+
+def searched() -> dict[str, Said]:
+    """What the searches on one GPU chose, each once, and how long they took."""
+    sources = frozenset(source(path.stem, call) for call, path in _searches().values())
+    rows = answers()
+    evidence = Evidence(1, sources) if rows else None
+    chosen = (
+        f"`{task}` {best['gmis_per_gpu']} x {best['num_envs']:,} ({best['impl']})"
+        for task, best in ((task, row["best"]) for task, row in rows.items())
+    )
+    seconds = bounds([row["wall_s"] for row in rows.values()], ".0f")
+    return {
+        "answers": Said(", ".join(chosen) or NOT_MEASURED, evidence),
+        "search_s": Said(f"{seconds} s", evidence),
+    }
 
 
 def answers() -> dict[str, Mapping[str, Any]]:
@@ -105,11 +125,18 @@ def read_layout(text: str) -> str:
     return f"{len(gpus)} x {gpus[0].count(',') + 1}"
 
 
-def model_fit() -> str:
-    """Measured over predicted time of all reductions of the paper's strategies."""
-    rows = [row for call, _ in reductions().values() for row in call.results["rows"]]
-    fits = [row["median_s"] / row["predicted_s"] for row in rows if row["predicted_s"]]
-    return bounds(fits, ".3g")
+def model_fit() -> Said:
+    """Measured over predicted time of all reductions of the paper's strategies, in one call."""
+    fits = [
+        Ratio(
+            row["median_s"] / row["predicted_s"],
+            Evidence(1, frozenset([source(path.stem, call)])),
+        )
+        for call, path in reductions().values()
+        for row in call.results["rows"]
+        if row["predicted_s"]
+    ]
+    return said_bounds(fits, ".3g")
 
 
 @table("faults", "fault | seconds until all GMIs train again:", "faults-h200")
@@ -123,7 +150,7 @@ def seconds_to_recover() -> dict[str, Figure | None]:
     kinds: dict[str, list[float]] = {}
     for row in results_of("faults-h200").get("rows", ()):
         kinds.setdefault(row["fault"], []).append(row["seconds"])
-    return {kind: figure(seconds) for kind, seconds in kinds.items()}
+    return {kind: figure(s, *sources_of("faults-h200")) for kind, s in kinds.items()}
 
 
 @table(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
+from benchmarks.evaluation.evidence import Ratio, source
+from benchmarks.evaluation.figures import Figure, figure, over, shown
 from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
 from benchmarks.records import Call, calls_by_date
 from benchmarks.steady import are_alike
@@ -22,7 +24,8 @@ class _Training:
       ways: the rows of each way, in the order of the file.
     """
 
-    def __init__(self, call: Call, name: str) -> None:
+    def __init__(self, call: Call, path: Path, name: str) -> None:
+        self._source = source(path.stem, call)
         self.ways: dict[str, list[Mapping[str, Any]]] = {}
         for row in _succeeded(call):
             if row["name"] == name:
@@ -30,9 +33,10 @@ class _Training:
 
     def rate(self, way: str, key: str) -> Figure | None:
         """A rate over the repeats of a way."""
-        return figure([row[key] for row in self.ways.get(way, ()) if row.get(key) is not None])
+        rates = [row[key] for row in self.ways.get(way, ()) if row.get(key) is not None]
+        return figure(rates, self._source)
 
-    def over_one(self, way: str, key: str) -> float | None:
+    def over_one(self, way: str, key: str) -> Ratio | None:
         """A rate over that of one at a time."""
         alone = next((one for one in self.ways if one.startswith("1 ")), "")
         return over(self.rate(way, key), self.rate(alone, key))
@@ -61,8 +65,8 @@ def _of_trainings() -> Calls:
 )
 def packs(calls: Calls) -> Rows:
     """Steps per second and trainings per hour of every training, by number at once."""
-    for name, (call, _) in calls.items():
-        training = _Training(call, name)
+    for name, (call, path) in calls.items():
+        training = _Training(call, path, name)
         rows = [row for rows in training.ways.values() for row in rows]
         has_curves = any(row.get("curves") for row in rows)
         is_mix = not all(are_alike(row["jobs"]) for row in rows)  # Its steps do not add up.
@@ -79,11 +83,11 @@ def packs(calls: Calls) -> Rows:
             yield ["" if number else name, way, *(["", ""] if is_mix else cells[:2]), *cells[2:]]
 
 
-def eight_packed(name: str) -> dict[str, str]:
-    """What eight of a training at once gain over one, in `n` repeats of its newest call."""
-    calls, way = _of_trainings(), "8 at once, mps"
+def eight_packed(name: str) -> dict[str, Ratio | None]:
+    """What eight of a training at once gain over one, in its newest call."""
+    calls = _of_trainings()
     if name not in calls:
-        return {"steps": NOT_MEASURED, "finished": NOT_MEASURED, "n": "0"}
-    training = _Training(calls[name][0], name)
-    steps, finished = (shown(training.over_one(way, key)) for key in (_STEPS, _FINISHED))
-    return {"steps": steps, "finished": finished, "n": str(len(training.ways.get(way, ())))}
+        return {"steps": None, "finished": None}
+    training = _Training(*calls[name], name)
+    gains = (training.over_one("8 at once, mps", key) for key in (_STEPS, _FINISHED))
+    return dict(zip(("steps", "finished"), gains, strict=True))

@@ -5,63 +5,84 @@ Their words are in `advice.md` and `front.md`. Importing this registers every ta
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
 from benchmarks.evaluation import claims, learning_tables, seed_tables  # noqa: F401
-from benchmarks.evaluation.async_tables import asynchronous_gains
-from benchmarks.evaluation.figures import NOT_MEASURED, Figure, bounds, shown
+from benchmarks.evaluation.async_tables import asynchronous_gains, beside_a_learner
+from benchmarks.evaluation.evidence import Ratio, Said
+from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, Figure, said, said_bounds
 from benchmarks.evaluation.learning_tables import seconds_to_mark, seconds_until_it_walks
 from benchmarks.evaluation.other_tables import seconds_to_recover
 from benchmarks.evaluation.pack_tables import CLEANRL, MJLAB, eight_packed
 from benchmarks.evaluation.peer_tables import over_brax
-from benchmarks.evaluation.plots import mps_gains
-from benchmarks.evaluation.sweep_tables import first_gains, program_over_processes
+from benchmarks.evaluation.serving_tables import mps_gains
+from benchmarks.evaluation.sweep_tables import KEYS as KEYS_OF_SWEEPS
+from benchmarks.evaluation.sweep_tables import eight_at_once, processes_over_program
 from benchmarks.evaluation.tables import best_plan_ratios, fixed_total_ratios, over_one_gpu
-from benchmarks.evaluation.writer import TABLES, filled, lines
+from benchmarks.evaluation.writer import SAID, TABLES, Values, words
 
-__all__ = ["TABLES", "advice"]
-
-EIGHT = "8 at once, auto"
+__all__ = ["SAID", "TABLES"]
 
 
-@lines("advice")
-def advice() -> list[str]:
+STEPS, FINISHED = "steps", "finished"
+Gains: TypeAlias = Mapping[str, Sequence[Figure | Ratio | None]]
+"""In steps/s, and in trainings that finish: one or several, of several cases."""
+
+
+def gains() -> dict[str, Gains]:
+    """What several GMIs gain or lose, by the names of rows in `advice.md`."""
+    eight = {key: [eight_at_once(sweeps)] for key, sweeps in KEYS_OF_SWEEPS.items()}
+    program = {key: [processes_over_program(sweeps)] for key, sweeps in KEYS_OF_SWEEPS.items()}
+    return {
+        "eight": eight,
+        "program": program,
+        "mjlab": {key: [gain] for key, gain in eight_packed(MJLAB).items()},
+        "cleanrl": {key: [gain] for key, gain in eight_packed(CLEANRL).items()},
+        "mps": {STEPS: [*mps_gains().values()]},
+        "off_policy": {STEPS: beside_a_learner()},
+        "fixed_total": {STEPS: [*fixed_total_ratios().values()]},
+        "best_plans": {STEPS: [*best_plan_ratios().values()]},
+        "two_gpus": {STEPS: [over_one_gpu(2)]},
+        "four_gpus": {STEPS: [over_one_gpu(4)]},
+        **{
+            f"asynchronous_{gpus}": {
+                STEPS: asynchronous_gains(gpus, TRAINING),
+                FINISHED: asynchronous_gains(gpus, WHOLE_RUN),
+            }
+            for gpus in (1, 2)
+        },
+    }
+
+
+@words("advice")
+def advice() -> Values:
     """Who gains from GMIs, and who does not."""
-    return filled(
-        "advice",
-        eight_steps=shown(first_gains("steady_steps_per_s").get(EIGHT)),
-        eight_finished=shown(first_gains().get(EIGHT)),
-        program=program_over_processes(),
-        mjlab=eight_packed(MJLAB),
-        cleanrl=eight_packed(CLEANRL),
-        mps=bounds([*mps_gains().values()]),
-        fixed_total=bounds([*fixed_total_ratios().values()]),
-        best_plans=bounds([*best_plan_ratios().values()]),
-        two_gpus=shown(over_one_gpu(2)),
-        four_gpus=shown(over_one_gpu(4)),
-        asynchronous_1=bounds(asynchronous_gains(1)),
-        asynchronous_2=bounds(asynchronous_gains(2)),
-    )
+    return {
+        name: {
+            key: said(found[0]) if len(found) == 1 else said_bounds(found)
+            for key, found in of_row.items()
+        }
+        for name, of_row in gains().items()
+    }
 
 
-@lines("front")
-def front() -> list[str]:
-    """What was measured, on which GPU, each with a link to the section that has its file."""
-    beside = [value for value in over_brax() if value is not None]
-    return filled(
-        "front",
-        ant=_of(seconds_to_mark("ant"), ".1f"),
-        go1=_of(seconds_until_it_walks("go1"), ".0f"),
-        eight=_of(first_gains("steady_steps_per_s").get(EIGHT), ".2f"),
-        mjlab=eight_packed(MJLAB),
-        cleanrl=eight_packed(CLEANRL),
-        over_brax=bounds(beside),
-        comparisons=str(len(beside)),
-        kill=_of(seconds_to_recover().get("kill"), ".0f"),
-    )
+@words("front")
+def front() -> Values:
+    """What was measured, each with a link to the section that has its file."""
+    beside = [one for one in over_brax() if one.evidence.is_enough]
+    return {
+        "ant": said(_brief(seconds_to_mark("ant")), ".1f"),
+        "go1": said(_brief(seconds_until_it_walks("go1")), ".0f"),
+        "eight": said(_brief(eight_at_once(KEYS_OF_SWEEPS[STEPS]))),
+        "mjlab": {key: said(gain) for key, gain in eight_packed(MJLAB).items()},
+        "cleanrl": {key: said(gain) for key, gain in eight_packed(CLEANRL).items()},
+        "over_brax": said_bounds(beside),
+        "comparisons": Said(str(len(beside)), None),
+        "kill": said(_brief(seconds_to_recover().get("kill")), ".0f"),
+    }
 
 
-def _of(found: Figure | None, form: str) -> dict[str, str]:
-    """A median, and how many runs it is of."""
-    if found is None:
-        return {"median": NOT_MEASURED, "runs": "0 runs"}
-    runs = "1 run" if found.repeats == 1 else f"{found.repeats} runs"
-    return {"median": format(found.median, form), "runs": runs}
+def _brief(found: Figure | None) -> Ratio | None:
+    """Only its median; how many runs it is of stands beside it."""
+    return found and Ratio(found.median, found.evidence)

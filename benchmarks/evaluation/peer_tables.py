@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from benchmarks.evaluation.evidence import Ratio, Source, source
 from benchmarks.evaluation.figures import Figure, figure, over, shown
 from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
 from benchmarks.peers.comparisons import BRAX, COMPARISONS, MJLAB, OURS, case_name
@@ -43,21 +44,35 @@ def row(results: Mapping[str, Any], comparison: str) -> list[str]:
     return [comparison, peer, *rates, gain, *seconds]
 
 
-def over_brax() -> list[float | None]:
+def over_brax() -> list[Ratio]:
     """Steps per second over those of Brax's PPO, of every comparison."""
     calls = {name: call for name, call in measured().items() if COMPARISONS[name].peer == BRAX}
-    return [_ratio(call.results, name) for name, (call, _) in calls.items()]
+    found = (
+        _ratio(call.results, name, source(path.stem, call)) for name, (call, path) in calls.items()
+    )
+    return [one for one in found if one is not None]
 
 
-def _ratio(results: Mapping[str, Any], comparison: str) -> float | None:
-    return over(*_both(results, comparison, "steps_per_s"))
+def our_rate(comparison: str) -> Figure | None:
+    """Our steps/s in a comparison."""
+    if comparison not in (found := measured()):
+        return None
+    call, path = found[comparison]
+    return _both(call.results, comparison, "steps_per_s", source(path.stem, call))[0]
 
 
-def _both(results: Mapping[str, Any], comparison: str, key: str) -> list[Figure | None]:
+def _ratio(results: Mapping[str, Any], comparison: str, *sources: Source) -> Ratio | None:
+    return over(*_both(results, comparison, "steps_per_s", *sources))
+
+
+def _both(
+    results: Mapping[str, Any], comparison: str, key: str, *sources: Source
+) -> list[Figure | None]:
     """A figure of both sides, ours first."""
     cases = results.get("cases", {})
     found = []
     for trainer in (OURS, COMPARISONS[comparison].peer):
         runs = cases.get(case_name(comparison, trainer), {}).get("runs", ())
-        found.append(figure([run["summary"][key] for run in runs if "summary" in run]))
+        values = [run["summary"][key] for run in runs if "summary" in run]
+        found.append(figure(values, *sources))
     return found

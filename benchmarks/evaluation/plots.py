@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from html import unescape
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -14,73 +15,110 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as Picture
 from matplotlib.transforms import blended_transform_factory
 
-from benchmarks.evaluation.paper import lgr_gain
-from benchmarks.evaluation.serving_tables import TASKS, mps_over_share
-from benchmarks.evaluation.sweep_tables import first_gains
-from benchmarks.evaluation.tables import (
-    LAYOUTS,
-    fixed_total_ratios,
-    over_one_gpu,
-    reduction_gain,
-)
+from benchmarks.evaluation.evidence import LEAST, Ratio
+from benchmarks.evaluation.figures import Figure
+from benchmarks.evaluation.page import FINISHED, STEPS, gains
+from benchmarks.evaluation.paper import LGR, lgr_gain
+from benchmarks.evaluation.tables import LAYOUTS, reduction_gain
 from gmijax.runs.folder import write_text
 
 FOLDER = Path(__file__).parents[2] / "docs" / "img"
-Bars = dict[str, float | None]
-Groups = dict[str, Bars]
-"""Heading -> the bars below it."""
-
-LEFT_OF_ONE, RIGHT_OF_ONE, OF_THE_PAPER = "#c55", "#2a7", "#999"
 PAPER = "paper"
 
 
-def summary() -> Groups:
-    """What several GMIs on a GPU gain and lose, in the order of the advice."""
-    return {
-        "small training runs at once, over one after another": {
-            way.removesuffix(", auto"): gain.median
-            for way, gain in first_gains().items()
-            if way.endswith(", auto")
+class Bar(NamedTuple):
+    """One of a picture.
+
+    Attributes:
+      name: to its left; empty: it belongs to the one above.
+      low: its end.
+      high: of a range, the other end.
+      kind: `STEPS`, `FINISHED` or `PAPER`.
+      is_sure: whether commit, date and three runs back it.
+    """
+
+    name: str
+    low: float
+    high: float
+    kind: str
+    is_sure: bool
+
+
+Groups = dict[str, list[Bar]]
+"""Heading -> the bars below it."""
+
+LEFT_OF_ONE, AROUND_ONE, RIGHT_OF_ONE, OF_THE_PAPER = "#c55", "#ca4", "#2a7", "#999"
+
+PALE = (
+    "right of 1 is a gain; a thin line goes from the lowest case to the highest\n"
+    f"pale: fewer than {LEAST} runs, or commit unknown"
+)
+
+SUMMARY = MappingProxyType(
+    {
+        "many trainings at once, over one after another": {
+            "eight": "8 of ant",
+            "mjlab": "8 of mjlab's Go1",
+            "cleanrl": "8 of CleanRL's PPO",
         },
-        "serving under MPS, over plain sharing": mps_gains(),
-        "one large training run in several GMIs, over one process": one_training(),
-        "one GMI on each of several GPUs, over one GPU": {
-            f"{gpus} GPUs": over_one_gpu(gpus) for gpus in (2, 4)
+        "processes under MPS, over plain sharing": {"mps": "2 to 8 that serve"},
+        "8 trainings in 8 processes, over one program": {"program": "8 of ant"},
+        "one training in several GMIs, over one process": {
+            "off_policy": "SAC, agent + learner",
+            "best_plans": "PPO, each at its best",
+            "fixed_total": "PPO, same environments",
+        },
+        "agents and trainers apart, over synchronous": {
+            "asynchronous_1": "one GPU",
+            "asynchronous_2": "two GPUs",
         },
     }
+)
+"""Heading -> row of the advice -> name, from gains to losses."""
 
 
-def mps_gains() -> Bars:
-    """Serving under MPS over plain sharing, with the fewest and the most GMIs."""
-    return {f"{task}, {n} GMIs": mps_over_share(task, n) for task in TASKS for n in (2, 8)}
-
-
-def one_training() -> Bars:
-    """The same environments in several GMIs over one process, without the names of files."""
-    bars: Bars = {}
-    for what, gain in fixed_total_ratios().items():
-        name = what.partition(" (")[0]
-        while name in bars:
-            name += ", again"
-        bars[name] = gain
-    return bars
+def summary() -> Groups:
+    """What several GMIs on a GPU gain and lose: the figures of the advice."""
+    of = gains()
+    return {
+        heading: [
+            bar
+            for row, name in names.items()
+            for kind, found in of[row].items()
+            for bar in _bar("" if kind == FINISHED else name, kind, found)
+        ]
+        for heading, names in SUMMARY.items()
+    }
 
 
 def lgr() -> Groups:
     """LGR here and in the paper."""
     groups: Groups = {}
-    for task in ("ant", "humanoid", "shadow_hand"):
-        bars = groups.setdefault(task, {})
+    for task in LGR:
+        bars = groups.setdefault(task, [])
         for at, name in LAYOUTS.items():
-            bars[name] = reduction_gain(task, at, "one_shot")
-            bars[f"{name}, {PAPER}"] = lgr_gain(task, at)
+            bars += _bar(name, STEPS, [reduction_gain(task, at, "one_shot")])
+            gain = lgr_gain(task, at)
+            bars.append(Bar(f"{name}, {PAPER}", gain, gain, PAPER, is_sure=True))
     return groups
+
+
+def _bar(name: str, kind: str, found: Sequence[Figure | Ratio | None]) -> Iterator[Bar]:
+    """Of what was measured, if anything."""
+    measured = [one for one in found if one is not None]
+    if measured:
+        ends = [one.median if isinstance(one, Figure) else float(one) for one in measured]
+        is_sure = all(one.evidence.is_enough for one in measured)
+        yield Bar(name, min(ends), max(ends), kind, is_sure)
 
 
 PICTURES: MappingProxyType[str, tuple[Callable[[], Groups], str]] = MappingProxyType(
     {
-        "evaluation-summary": (summary, "times the throughput; right of 1 is a gain"),
-        "evaluation-lgr": (lgr, "times the steps/s of mpr; right of 1 is a gain"),
+        "evaluation-summary": (
+            summary,
+            "times the steps/s; hatched: times the trainings per hour\n" + PALE,
+        ),
+        "evaluation-lgr": (lgr, "times the steps/s of mpr\n" + PALE),
     }
 )
 """Name -> its bars, and what their length is."""
@@ -101,55 +139,58 @@ def is_current(name: str, folder: Path = FOLDER) -> bool:
 def _numbers(groups: Groups) -> str:
     return json.dumps(
         {
-            heading: {name: None if v is None else round(v, 4) for name, v in bars.items()}
+            heading: [[*bar[:1], round(bar.low, 4), round(bar.high, 4), *bar[3:]] for bar in bars]
             for heading, bars in groups.items()
         }
     )
 
 
 def _draw(groups: Groups, meaning: str, path: Path) -> None:
-    rows = list(_rows(groups))
+    rows = [row for heading, bars in groups.items() if bars for row in (heading, *bars)]
     # Narrow, so that a phone need not make the words much smaller.
-    picture = Picture(figsize=(5.6, 0.6 + 0.22 * len(rows)), layout="constrained")
+    picture = Picture(figsize=(5.6, 1.0 + 0.22 * len(rows)), layout="constrained")
     FigureCanvasSVG(picture)
     axes: Axes = picture.subplots()
     from_left_edge = blended_transform_factory(picture.transFigure, axes.transData)
-    for at, (name, value) in enumerate(rows):
-        if value is None:
+    for at, row in enumerate(rows):
+        if isinstance(row, Bar):
+            _draw_bar(axes, at, row)
+        else:
             place = {"transform": from_left_edge, "va": "center", "in_layout": False}
-            axes.text(0.01, at, name, weight="bold", **place)
-            continue
-        colour = RIGHT_OF_ONE if value >= 1 else LEFT_OF_ONE
-        axes.barh(at, value, color=OF_THE_PAPER if name.endswith(PAPER) else colour)
-        axes.plot([1, 1], [at - 0.5, at + 0.5], color="black", linewidth=1)
-        # Not on the line at 1, which would cross it out.
-        end = (max(value, 1), at)
-        axes.annotate(f"{value:.2f}", end, (3, 0), textcoords="offset points", va="center")
-    axes.set_yticks(*_ticks(rows))
+            axes.text(0.01, at, row, weight="bold", **place)
+    named = {at: row.name for at, row in enumerate(rows) if isinstance(row, Bar)}
+    axes.set_yticks([*named], [*named.values()])
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(0)
     axes.margins(x=0.1)
-    axes.set_xlabel(meaning)
+    picture.supxlabel(meaning, fontsize=9)
     axes.spines[["top", "right", "left"]].set_visible(False)
-    metadata = {"Date": None, "Description": _numbers(groups)}
+    _save(picture, path, _numbers(groups))
+
+
+def _draw_bar(axes: Axes, at: int, bar: Bar) -> None:
+    alpha, hatch = 1.0 if bar.is_sure else 0.45, "////" if bar.kind == FINISHED else None
+    axes.barh(at, bar.low, color=_colour(bar), alpha=alpha, hatch=hatch, edgecolor="white")
+    line = {"linewidth": 3, "solid_capstyle": "butt", "alpha": alpha}
+    axes.plot([bar.low, bar.high], [at, at], color=_colour(bar), **line)
+    axes.plot([1, 1], [at - 0.5, at + 0.5], color="black", linewidth=1)
+    low, high = f"{bar.low:.2f}", f"{bar.high:.2f}"
+    # Not on the line at 1, which would cross it out.
+    place = {"xytext": (3, 0), "textcoords": "offset points", "va": "center"}
+    axes.annotate(low if low == high else f"{low} to {high}", (max(bar.high, 1), at), **place)
+
+
+def _colour(bar: Bar) -> str:
+    if bar.kind == PAPER:
+        return OF_THE_PAPER
+    return RIGHT_OF_ONE if bar.low >= 1 else LEFT_OF_ONE if bar.high < 1 else AROUND_ONE
+
+
+def _save(picture: Picture, path: Path, numbers: str) -> None:
+    metadata = {"Date": None, "Description": numbers}
     with mpl.rc_context({"svg.hashsalt": "gmijax", "svg.fonttype": "none"}):
         path.parent.mkdir(parents=True, exist_ok=True)
         picture.savefig(path, format="svg", metadata=metadata)
     # Without spaces at the ends of lines, which checks of a commit complain about.
     write_text(path, "\n".join(line.rstrip() for line in path.read_text().splitlines()) + "\n")
-
-
-def _rows(groups: Groups) -> Iterator[tuple[str, float | None]]:
-    """Headings, without a value, and what was measured below each."""
-    for heading, bars in groups.items():
-        measured = {name: value for name, value in bars.items() if value is not None}
-        if measured:
-            yield heading, None
-            yield from measured.items()
-
-
-def _ticks(rows: Sequence[tuple[str, float | None]]) -> tuple[list[int], list[str]]:
-    """Where the names of bars stand, and the names."""
-    bars = [(at, name) for at, (name, value) in enumerate(rows) if value is not None]
-    return [at for at, _ in bars], [name for _, name in bars]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeAlias
 
-from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
+from benchmarks.evaluation.evidence import Evidence, Ratio, source
+from benchmarks.evaluation.figures import Figure, figure, over, shown
 from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
 from benchmarks.paper_model import Task, serving_gain
 from benchmarks.records import calls_by_date
@@ -47,29 +48,53 @@ def serving_rate(task: str, gmis: int, backend: str = "mps") -> Figure | None:
     """Steps/s of serving in GMIs that share 8192 environments."""
     case = _case(task, gmis, backend)
     runs = case["runs"]["tcg"] if case else ()
-    return figure([run["step_per_s_inference"] for run in runs])
+    sources = [source(path.stem, call) for call, path in _of_backends().values()]
+    return figure([run["step_per_s_inference"] for run in runs], *sources)
 
 
-def mps_over_share(task: str, gmis: int) -> float | None:
+def mps_over_share(task: str, gmis: int) -> Ratio | None:
     """Steps/s under MPS over those of plain sharing."""
     return over(serving_rate(task, gmis), serving_rate(task, gmis, "share"))
 
 
-def mps_over_one(task: str, gmis: int) -> float | None:
+def mps_gains() -> dict[str, Ratio | None]:
+    """Serving under MPS over plain sharing, with the fewest and the most GMIs."""
+    return {f"{task}, {n} GMIs": mps_over_share(task, n) for task in TASKS for n in (2, 8)}
+
+
+def mps_over_one(task: str, gmis: int) -> Ratio | None:
     """Steps/s of GMIs under MPS over one process, of one call."""
     return over(serving_rate(task, gmis), serving_rate(task, 1))
 
 
-def templates_gains() -> list[float]:
+def templates_gains() -> list[Ratio]:
     """Steps/s of one GMI for all tasks over one for each, of every case."""
-    cases = [case for case in _cases(_of_templates()) if "simulator_s" in case]
-    return [case["colocated"] / case["dedicated"] for case in cases]
+    return [
+        Ratio(case["colocated"] / case["dedicated"], evidence)
+        for case, evidence in _of_both_templates()
+    ]
+
+
+def of_communication() -> list[Ratio]:
+    """Time to move experience between GMIs over that of simulator and agent, of every case."""
+    return [
+        Ratio(case["com_s"] / (case["simulator_s"] + case["agent_s"]), evidence)
+        for case, evidence in _of_both_templates()
+    ]
+
+
+def _of_both_templates() -> Iterator[tuple[Case, Evidence]]:
+    calls = _of_templates()
+    sources = frozenset(source(path.stem, call) for call, path in calls.values())
+    for case in _cases(calls):
+        if "simulator_s" in case:
+            yield case, Evidence(min(map(len, case["runs"].values())), sources)
 
 
 @table_of_calls(
     "backends",
     "task | MJX | GMIs x environments | `mps`, steps/s: | `share`, steps/s: | ratio: | "
-    "over one process: | MIG:",
+    "over one process:",
     _of_backends,
 )
 def backends(_: Calls) -> Rows:
@@ -82,7 +107,7 @@ def backends(_: Calls) -> Rows:
                 rates = (shown(one, ",.0f") for one in pair)
                 gains = shown(over(*pair)), shown(mps_over_one(task, gmis))
                 size = f"{gmis} x {8192 // gmis:,}"
-                yield [f"`{task}`", impl, size, *rates, *gains, NOT_MEASURED]
+                yield [f"`{task}`", impl, size, *rates, *gains]
 
 
 SERVING_HEAD = (

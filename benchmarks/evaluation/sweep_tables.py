@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
+from benchmarks.evaluation.evidence import Ratio, Source, source
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
 from benchmarks.evaluation.writer import line_of, lines, markdown
 from benchmarks.records import Call, calls_by_date
 
 PATTERN = "sweeps-nvidia-*.json"
 ONE_AFTER_ANOTHER = "1 at once, auto"
+STEPS, FINISHED = "steady_steps_per_s", "trainings_per_hour"
+KEYS = MappingProxyType({"steps": STEPS, "finished": FINISHED})
 HEAD = (
     "at once | sweeps: | runs per hour: | over one after another: | over plain sharing: | "
     "steps/s in all:"
@@ -26,39 +30,45 @@ class SameJobs(NamedTuple):
     Attributes:
       calls: that ran them, as lines of Markdown.
       runs: the number of the call, the way, and what succeeded in it.
+      sources: the calls.
     """
 
     calls: list[str]
     runs: list[tuple[int, str, Run]]
+    sources: list[Source]
 
-    def rates(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
+    def rates(self, key: str = FINISHED) -> dict[str, Figure]:
         """A figure of all sweeps, by way."""
-        return _figures((way, run[key]) for _, way, run in self.runs)
+        return _figures(((way, run[key]) for _, way, run in self.runs), self.sources)
 
-    def gains(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
+    def gains(self, key: str = FINISHED) -> dict[str, Figure]:
         """A figure over that of one after another, each ratio of one call."""
         return self._ratios(lambda way: ONE_AFTER_ANOTHER, key)
 
     def gains_over_sharing(self) -> dict[str, Figure]:
         """Jobs per hour over those of as many at once under plain sharing."""
-        return self._ratios(lambda way: way.replace(", auto", ", share"), "trainings_per_hour")
+        return self._ratios(lambda way: way.replace(", auto", ", share"), FINISHED)
 
     def _ratios(self, base_of: Callable[[str], str], key: str) -> dict[str, Figure]:
-        of_call = _figures(((number, way), run[key]) for number, way, run in self.runs)
-        return _figures(
+        rates = (((number, way), run[key]) for number, way, run in self.runs)
+        of_call = _figures(rates, self.sources)
+        gains = (
             (way, found.median / of_call[number, base].median)
             for (number, way), found in of_call.items()
             if (base := base_of(way)) != way and (number, base) in of_call
         )
+        return _figures(gains, self.sources)
 
 
-def _figures(values: Iterable[tuple[Key, float | None]]) -> dict[Key, Figure]:
+def _figures(
+    values: Iterable[tuple[Key, float | None]], sources: Sequence[Source]
+) -> dict[Key, Figure]:
     """Those with the same key together, without what has no value."""
     together: dict[Key, list[float]] = {}
     for key, value in values:
         if value is not None:
             together.setdefault(key, []).append(value)
-    return {key: median for key, found in together.items() if (median := figure(found))}
+    return {key: median for key, found in together.items() if (median := figure(found, *sources))}
 
 
 def same_jobs() -> dict[str, SameJobs]:
@@ -68,35 +78,32 @@ def same_jobs() -> dict[str, SameJobs]:
         for run in call.results["runs"]:
             at_once, backend, *tasks = run["way"].split(", ")
             if run["status"] == "completed":
-                same = found.setdefault(_described(call, tasks), SameJobs([], []))
+                same = found.setdefault(_described(call, tasks), SameJobs([], [], []))
                 if number not in {one for one, *_ in same.runs}:
                     same.calls.append(line_of(path.name, call))
+                    same.sources.append(source(path.stem, call))
                 same.runs.append((number, f"{at_once}, {backend}", run))
     return found
 
 
-def first_gains(key: str = "trainings_per_hour") -> dict[str, Figure]:
-    """What the jobs of the first call gain at once, over one after another."""
-    return next((same.gains(key) for same in same_jobs().values()), {})
+def eight_at_once(key: str) -> Figure | None:
+    """What eight of the jobs of the first call gain at once, over one after another."""
+    gains = next((same.gains(key) for same in same_jobs().values()), {})
+    return gains.get("8 at once, auto")
 
 
-def program_over_processes() -> dict[str, str]:
-    """Eight jobs as one program, over the same jobs in eight processes, and of how many sweeps.
+def processes_over_program(key: str) -> Ratio | None:
+    """Eight jobs in eight processes, over the same jobs as one program.
 
     Of the jobs that were measured most often so, the newest.
     """
-    found = {"steps": NOT_MEASURED, "finished": NOT_MEASURED, "n": "0"}
+    best = None
     for same in same_jobs().values():
-        gains = {}
-        for name, key in (("steps", "steady_steps_per_s"), ("finished", "trainings_per_hour")):
-            rates = same.rates(key)
-            program, processes = rates.get("8 at once, vmap"), rates.get("8 at once, auto")
-            if program and processes:
-                gains[name] = shown(over(program, processes))
-                gains["n"] = str(min(program.repeats, processes.repeats))
-        if len(gains) == len(found) and int(gains["n"]) >= int(found["n"]):
-            found = gains
-    return found
+        rates = same.rates(key)
+        gain = over(rates.get("8 at once, auto"), rates.get("8 at once, vmap"))
+        if gain and (best is None or gain.evidence.repeats >= best.evidence.repeats):
+            best = gain
+    return best
 
 
 @lines("sweeps")
@@ -105,7 +112,7 @@ def sweeps() -> list[str]:
     found: list[str] = []
     for what, same in same_jobs().items():
         gains, sharing = same.gains(), same.gains_over_sharing()
-        steps = same.rates("steady_steps_per_s")
+        steps = same.rates(STEPS)
         rows = [
             [
                 way,

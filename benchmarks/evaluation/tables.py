@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from itertools import product
 
 from benchmarks.cases import PLANS, TASKS
+from benchmarks.evaluation.evidence import Ratio
 from benchmarks.evaluation.figures import (
     Figure,
     busy_sms,
@@ -16,6 +17,7 @@ from benchmarks.evaluation.figures import (
     ratio,
     results_of,
     shown,
+    sources_of,
     summaries,
 )
 from benchmarks.evaluation.paper import LGR, lgr_gain
@@ -81,7 +83,9 @@ def pair(file: str, case: str, base: str) -> tuple[Figure | None, Figure | None]
     for one in results_of(file).get("calls", ()):
         if {case, base} <= one["cases"].keys():
             several, alone = (
-                figure([run["steps_per_s"] for run in one["cases"][name]["base"]])
+                figure(
+                    [run["steps_per_s"] for run in one["cases"][name]["base"]], *sources_of(file)
+                )
                 for name in (case, base)
             )
             return several, alone
@@ -99,7 +103,7 @@ def exchange_of(file: str, case: str) -> str:
     return found[0]["plan"]["strategy"] if found else "auto"
 
 
-def fixed_total_ratios() -> dict[str, float]:
+def fixed_total_ratios() -> dict[str, Ratio]:
     """Several GMIs on one GPU over one process with as many environments, as jobs exchange now."""
     return {
         f"{what} ({file})": gain
@@ -131,9 +135,9 @@ def fastest(task: str, *, several: bool) -> tuple[Figure, str] | None:
     return max(found, default=None, key=lambda one: one[0].median)
 
 
-def best_plan_ratios() -> dict[str, float | None]:
+def best_plan_ratios() -> dict[str, Ratio | None]:
     """Of every task the fastest several GMIs on one GPU over the fastest one process."""
-    ratios = {}
+    ratios: dict[str, Ratio | None] = {}
     for task in TASKS:
         one, several = fastest(task, several=False), fastest(task, several=True)
         ratios[task] = over(several[0], one[0]) if one and several else None
@@ -181,7 +185,7 @@ def weak_scaling() -> Rows:
             yield [f"{gpus} x {gmis} x {8192 // gmis:,}", f"`{way}`", *cells]
 
 
-def over_one_gpu(gpus: int) -> float | None:
+def over_one_gpu(gpus: int) -> Ratio | None:
     """Steps/s of several GPUs with one GMI on each, over those of one GPU."""
     gains = (ratio(file, scaling(gpus, 1), scaling(1, 1)) for file in WEAK)
     return next((gain for gain in gains if gain), None)
@@ -196,10 +200,10 @@ def _jobs_of_one_gpu() -> Iterator[tuple[str, str, str, str]]:
             yield task, f"{gmis} x {num_envs:,}", "plans", f"{task} {gmis} x {num_envs}"
 
 
-def busy_in_jobs(*, several: bool) -> list[float | None]:
+def busy_in_jobs(*, several: bool) -> list[Figure]:
     """Part of the SMs that trainings of one GPU keep busy, in one process or in several GMIs."""
     return [
-        found and found.median
+        found
         for _, size, file, case in _jobs_of_one_gpu()
         if size.startswith("1 x") != several and (found := busy_sms(file, case))
     ]
@@ -247,7 +251,7 @@ def _lgr(task: str) -> tuple[str, ...]:
     return tuple(f"lgr-{task}{way}" for way in ("", "-one_shot", "-mrr"))
 
 
-def reduction_gain(task: str, at: str, way: str) -> float | None:
+def reduction_gain(task: str, at: str, way: str) -> Ratio | None:
     """The ratio of the two."""
     return over(*with_and_without(task, at, way))
 

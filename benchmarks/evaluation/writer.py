@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from string import Formatter
 from typing import Any, TypeAlias, TypeVar
 
+from benchmarks.evaluation.evidence import Evidence, Said, together
 from benchmarks.evaluation.figures import NOT_MEASURED, call_of, repeats_of
 from benchmarks.records import Call, calls_by_date
 
@@ -15,9 +17,14 @@ Calls: TypeAlias = Mapping[Any, tuple[Call, Path]]
 MakeRows = TypeVar("MakeRows", bound=Callable[[], Rows])
 MakeRowsOfCalls = TypeVar("MakeRowsOfCalls", bound=Callable[[Calls], Rows])
 MakeLines = TypeVar("MakeLines", bound=Callable[[], list[str]])
+Values: TypeAlias = Mapping[str, Said | Mapping[str, Said]]
+MakeValues = TypeVar("MakeValues", bound=Callable[[], Values])
 
 TABLES: dict[str, Callable[[], list[str]]] = {}
 """By the name that documents use: `<!-- table: NAME -->`."""
+
+SAID: dict[str, Callable[[], list[tuple[str, Evidence | None]]]] = {}
+"""Of tables of words: every line, with what its figures are of."""
 
 
 def table(
@@ -99,9 +106,29 @@ def lines(name: str) -> Callable[[MakeLines], MakeLines]:
     return register
 
 
-def filled(name: str, **values: str | Mapping[str, str]) -> list[str]:
-    """The table in `<name>.md`, with figures in the places of their names."""
-    return (Path(__file__).parent / f"{name}.md").read_text().format(**values).splitlines()
+def words(name: str) -> Callable[[MakeValues], MakeValues]:
+    """Registers a function of the figures in `<name>.md` as a table."""
+
+    def register(make: MakeValues) -> MakeValues:
+        template = Path(__file__).parent / f"{name}.md"
+
+        def said() -> list[tuple[str, Evidence | None]]:
+            values = make()
+            return [_filled(line, values) for line in template.read_text().splitlines()]
+
+        SAID[name] = said
+        TABLES[name] = lambda: [line for line, _ in SAID[name]()]
+        return make
+
+    return register
+
+
+def _filled(line: str, values: Values) -> tuple[str, Evidence | None]:
+    """A line with figures in the places of their names; `{on}` is what they are of."""
+    names = [name for _, name, *_ in Formatter().parse(line) if name and name != "on"]
+    found = [Formatter().get_field(name, (), values)[0] for name in names]
+    evidence = together(one.evidence for one in found if one.evidence)
+    return line.format(**values, on=evidence or ""), evidence
 
 
 def markdown(head: str, rows: Sequence[Sequence[str]]) -> list[str]:

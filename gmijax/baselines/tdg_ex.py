@@ -3,7 +3,7 @@
 A trainer sends the weights to the GMIs that serve it, takes their rollouts of T steps, and updates
 as a co-located GMI would with all their environments. So m serving GMIs with N environments and
 one trainer learn what one GMI with m N does, up to rounding. Everything moves through host
-memory, as the paper has it (sec. 5.1, Table 4): experience to the trainer, parameters back.
+memory, as the paper has it (sec. 5.1, Table 5): experience to the trainer, parameters back.
 """
 
 from __future__ import annotations

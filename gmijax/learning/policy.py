@@ -1,6 +1,6 @@
 """Policy and value function: two separate multi-layer perceptrons.
 
-The sizes are those of the paper's Table 5 (256:128:64 for most tasks); ELU activations and a
+The sizes are those of the paper's Table 6 (256:128:64 for most tasks); ELU activations and a
 state-independent standard deviation are what Isaac Gym's PPO uses for the same tasks, layer norm
 and SiLU what FastSAC does. What the output of the policy's network means is said by its
 distribution.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,9 @@ from benchmarks.evaluation.page import TABLES
 from gmijax.errors import ConfigError
 
 REFERENCE = "runs.json#four, mps/step_per_s_train"
-MARKED = f"<!-- figure: {REFERENCE} over one/step_per_s_train .2f -->%s<!-- /figure -->\n"
+MARKED = (
+    f"<!-- figure: {REFERENCE} over one/step_per_s_train .2f -->%s<!-- /figure --> (one run)\n"
+)
 
 
 def write_results(folder: Path, name: str, cases: Any, commit: str | None = "1234567") -> None:
@@ -79,12 +80,6 @@ def test_every_table_stands_in_one_page_of_the_evaluation():
 def test_the_front_page_has_its_own_figures():
     text = (check.ROOT / "README.md").read_text()
     assert {match[2] for match in check.TABLE.finditer(text)} == {"front", "advice"}
-
-
-def test_a_figure_of_the_front_page_is_of_three_runs_at_least():
-    repeats = [int(n) for line in TABLES["front"]() for n in re.findall(r"(\d+) runs? \|", line)]
-    assert len(repeats) >= 5
-    assert min(repeats) >= 3
 
 
 @pytest.mark.usefixtures("results")
@@ -209,20 +204,3 @@ def test_marked_figures_are_counted(results: Path):
     write_results(results, "runs", {"four, mps": runs(1.0, 2.0, 3.0)}, commit=None)
     assert of_figure(REFERENCE) == (1, 0)
     assert of_figure("none.json#a") == (1, 0)
-
-
-def test_results_without_a_commit_are_planned_again(tmp_path: Path):
-    plan = tmp_path / "plan.md"
-    for name, commit in (("old", None), ("new", "abc1234")):
-        calls = [{"commit": commit, "results": {}}]
-        (tmp_path / f"{name}.json").write_text(json.dumps({"format": 2, "calls": calls}))
-    rows = "| files | command |\n|---|---|\n| {} | `python -m other` |\n\n## Other\n| `x` | |\n"
-    plan.write_text(rows.format("`old`"))
-    assert [*check.without_commit(tmp_path, plan)] == []
-    plan.write_text(rows.format("`new`, `gone`"))
-    found = [*check.without_commit(tmp_path, plan)]
-    assert [(one.file, one.line, one.text) for one in found] == [
-        ("plan.md", 3, "new"),
-        ("old.json", 1, "old"),
-        ("plan.md", 3, "gone"),
-    ]

@@ -76,7 +76,7 @@ def test_names_of_a_custom_task_are_free():
     assert (config.rewards, config.settings) == ({"near": 2.0}, {"length_m": 0.5})
 
 
-# Hidden layers in Table 5 of the paper; 256:128:64 for all others.
+# Hidden layers in Table 6 of the paper; 256:128:64 for all others.
 WIDTHS = {"humanoid": (200, 400, 100), "shadow_hand": (512, 512, 512, 256)}
 
 

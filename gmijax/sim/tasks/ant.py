@@ -1,4 +1,4 @@
-"""Ant: run along +x on four legs (paper Table 5; figures of Isaac Gym's Ant, arXiv:2108.10470).
+"""Ant: run along +x on four legs (paper Table 6; figures of Isaac Gym's Ant, arXiv:2108.10470).
 
 Observation [60]: torso height 1; linear and angular velocity in the torso's frame 3 + 3; yaw,
 roll, angle to target 3; upright projection 1; heading projection 1; joint positions, -1 to 1

@@ -1,4 +1,4 @@
-"""Anymal: a four-legged robot follows a commanded velocity (paper Table 5; figures of Isaac Gym).
+"""Anymal: a four-legged robot follows a commanded velocity (paper Table 6; figures of Isaac Gym).
 
 Observation [48], each value clipped to +-5: linear and angular velocity in the base's frame
 3 + 3; direction of gravity in it 3; commanded forward, sideways and yaw speed 3; joint positions

@@ -1,6 +1,6 @@
 """Ball balance: catch a falling ball with a tray on three legs and hold it in the middle.
 
-Paper Table 5; figures of Isaac Gym's BallBalance (arXiv:2108.10470).
+Paper Table 6; figures of Isaac Gym's BallBalance (arXiv:2108.10470).
 Observation [24], each value clipped to +-5: knee positions 3 and velocities 3; ball position 3
 and velocity 3; at the three hips the upward force 3 and the torque 9.
 Action [3]: speed of the knees' position targets.

@@ -1,6 +1,6 @@
 """Franka cabinet: open a drawer with an arm and a two-finger gripper.
 
-Paper Table 5; figures of Isaac Gym's FrankaCabinet (arXiv:2108.10470).
+Paper Table 6; figures of Isaac Gym's FrankaCabinet (arXiv:2108.10470).
 Observation [23], each value clipped to +-5: joint positions, -1 to 1 between their limits 9;
 joint velocities 9; way from the gripper to the handle 3; opening of the drawer 1; its speed 1.
 Action [9]: speed of the position targets of arm 7 and fingers 2.

@@ -1,6 +1,6 @@
 """Shadow hand: turn a cube in the palm until it lies as the goal does, again and again.
 
-Paper Table 5; figures of Isaac Gym's ShadowHand with full state (arXiv:2108.10470).
+Paper Table 6; figures of Isaac Gym's ShadowHand with full state (arXiv:2108.10470).
 Observation [211], each value clipped to +-5, quaternions (w, x, y, z): joint positions, -1 to 1
 between their limits 24; joint velocities 24; servos' torques on the joints 24; cube: position 3,
 quaternion 4, velocity 3, angular velocity 3; goal: position 3, quaternion 4; rotation from goal

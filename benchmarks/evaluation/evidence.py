@@ -1,0 +1,110 @@
+"""What a figure is of: how many runs, and files of results whose commit and date are known or not.
+
+Figures keep it (`figures.Figure`), and so do their ratios and what a table of words says.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from benchmarks.records import Call
+
+LEAST = 3
+"""Runs of each case that a reader may ask for."""
+
+
+class Source(NamedTuple):
+    """A call of a file of results.
+
+    Attributes:
+      file: its name without `.json`.
+      has_origin: whether commit and date of the call are known.
+      gpu: its kind, e.g. `H200`; empty if there was none or the file does not say.
+    """
+
+    file: str
+    has_origin: bool
+    gpu: str = ""
+
+
+class Evidence(NamedTuple):
+    """What one figure, or several together, are of.
+
+    Attributes:
+      repeats: runs of the case that ran least often.
+      sources: of all of them.
+    """
+
+    repeats: int
+    sources: frozenset[Source] = frozenset()
+
+    @property
+    def has_origin(self) -> bool:
+        """Whether commit and date are known of all."""
+        return bool(self.sources) and all(one.has_origin for one in self.sources)
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether a reader can believe it: commit, date and `LEAST` runs."""
+        return self.has_origin and self.repeats >= LEAST
+
+    def __str__(self) -> str:
+        gpus = sorted({one.gpu for one in self.sources if one.gpu})
+        runs = "1 run" if self.repeats == 1 else f"{self.repeats} runs"
+        unknown = [] if self.has_origin else ["commit unknown"]
+        return ", ".join([" and ".join(gpus) or "CPU", runs, *unknown])
+
+
+class Ratio(float):
+    """A ratio of two figures.
+
+    Attributes:
+      evidence: of both.
+    """
+
+    evidence: Evidence
+
+    def __new__(cls, value: float, evidence: Evidence) -> Ratio:
+        """A float that knows what it is of."""
+        made = super().__new__(cls, value)
+        made.evidence = evidence
+        return made
+
+
+class Said(NamedTuple):
+    """Words about figures.
+
+    Attributes:
+      text: the words.
+      evidence: of the figures; None if there are none.
+    """
+
+    text: str
+    evidence: Evidence | None
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def source(file: str, call: Call) -> Source:
+    """A call of `<file>.json`."""
+    gpu = re.search(r"NVIDIA (\w+)", call.device or "")
+    return Source(file, bool(call.commit and call.date), gpu[1] if gpu else "")
+
+
+def together(parts: Iterable[Evidence]) -> Evidence | None:
+    """Of several figures: the fewest runs, and all files. None of none."""
+    found = list(parts)
+    if not found:
+        return None
+    sources = frozenset[Source]().union(*(one.sources for one in found))
+    return Evidence(min(one.repeats for one in found), sources)
+
+
+def joined(between: str, parts: Iterable[Said]) -> Said:
+    """Several, with something between two of them."""
+    found = list(parts)
+    evidence = together(one.evidence for one in found if one.evidence)
+    return Said(between.join(one.text for one in found), evidence)
