@@ -48,11 +48,11 @@ def search(
     write_json(started.run.config, to_dict(config))
     console.print(f"run folder: {nearby(started.run.root)}")
     result = started.result()
-    print_next(console, ("train with these numbers", _training(config, overrides, result)))
+    print_next(console, ("train with these numbers", following(config, overrides, result)))
     return result
 
 
-def _training(config: TrainConfig, overrides: Sequence[str], result: SearchResult) -> str:
+def following(config: TrainConfig, overrides: Sequence[str], result: SearchResult) -> str:
     """The command that trains with what was found, beside what else was given."""
     given = overrides or (config.env.words, f"algo={config.algo.name}")
     left_out = ["run.dir=", "run.name=", "num_envs=", "plan.gmis_per_gpu="]

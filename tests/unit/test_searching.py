@@ -252,20 +252,24 @@ def test_a_job_with_too_few_gpus_is_refused_before_anything_is_profiled(
 
 
 @pytest.mark.parametrize(
-    ("overrides", "line"),
+    ("overrides", "trainers", "line"),
     [
         (
-            ("env=ant", "plan.gpus=2"),
-            "gmijax train env=ant num_envs=64 plan.gmis_per_gpu=4 physics.impl=warp plan.gpus=2",
+            ("env=ant", "algo=sac", "search.num_envs=[64]", "run.dir=s", "physics.impl=auto"),
+            0,
+            "env=ant algo=sac num_envs=64 plan.gmis_per_gpu=4 physics.impl=warp",
         ),
+        ((), 0, "env=ball_balance algo=ppo num_envs=64 plan.gmis_per_gpu=4 physics.impl=warp"),
         (
-            ("env=brax", "env.name=ant"),
-            "gmijax train env=brax env.name=ant num_envs=64 plan.gmis_per_gpu=4 physics.impl=warp",
+            ("algo=a3c", "search.num_envs=[64]"),
+            1,
+            "algo=a3c 'search.num_envs=[64]' num_envs=auto plan.gmis_per_gpu=auto",
         ),
     ],
 )
 def test_a_search_ends_with_the_training_that_follows(
-    overrides: tuple[str, ...], line: str
+    overrides: tuple[str, ...], trainers: int, line: str
 ) -> None:
     config = compose(*overrides, "num_envs=auto", command="search")
-    assert searching._training(config, SearchResult(None, 4, 64, "warp", "", {})) == line
+    found = SearchResult(None, 4, 64, "warp", "", {}, trainers)
+    assert searching.following(config, overrides, found) == f"gmijax train {line}"
