@@ -115,7 +115,7 @@ COMPARISONS: Mapping[str, Comparison] = MappingProxyType(
         "Go1, off-policy": Comparison(
             (
                 *("env=go1", "algo=sac", "physics.impl=warp", "env.settings.push=0"),
-                "num_timesteps=10000000",
+                "num_timesteps=6000000",
             ),
             peer=FAST_TD3,
         ),

@@ -103,7 +103,7 @@ def test_fast_td3_draws_as_many_transitions_for_each_that_it_makes(tmp_path: Pat
     assert flags["batch-size"] * flags["num-updates"] == 8 * flags["num-envs"]
     assert flags["num-updates"] == config.algo.updates_per_step
     assert flags["policy-frequency"] == config.algo.policy_every
-    assert flags["total-timesteps"] == round(10e6 / 4096)
+    assert flags["total-timesteps"] == round(6e6 / 4096)
     assert (flags["critic-hidden-dim"], flags["actor-hidden-dim"]) == (768, 512)
     assert (flags["env-name"], flags["amp"]) == ("Go1JoystickFlatTerrain", True)
     assert config.env.settings["push"] == 0
