@@ -107,7 +107,8 @@ class Side(NamedTuple):
         """Seconds, as in `curve`, and mean return of the latest episodes; empty: not told."""
         if self.trainer == OURS:
             lines = read_metrics(RunPaths(folder / "run").metrics)
-            return [(line["wall_s"], line["return"]) for line in lines if "return" in line]
+            told = [(line["wall_s"], line.get("return")) for line in lines]
+            return [(seconds, one) for seconds, one in told if one is not None]
         return read_json(folder / "out.json").get("returns", [])
 
     @property
