@@ -1,6 +1,7 @@
 """Training speed beside other libraries: `python -m benchmarks.peers`.
 
-The same training by `gmijax.train` and by Brax's PPO (mjlab: a task that is near), in turn, each
+The same training by `gmijax.train` and by Brax's PPO (or by mjlab: a task that is near;
+or by FastTD3, beside our SAC), in turn, each
 alone on the GPU in processes of its own. Both count alike: steps per second from the first report
 behind a fifth of the steps to the last one, and seconds of the whole command. All programs are
 compiled before, in short runs at the same time, so no command compiles. Adds a call to
@@ -16,13 +17,20 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from benchmarks.evaluation.peer_tables import HEAD, row
 from benchmarks.evaluation.writer import markdown
-from benchmarks.peers.comparisons import COMPARISONS, MJLAB, OURS, missing_package
+from benchmarks.peers.comparisons import (
+    COMPARISONS,
+    FAST_TD3,
+    MJLAB,
+    OURS,
+    missing_package,
+)
 from benchmarks.peers.side import Side
 from benchmarks.records import results_file
 from benchmarks.runner import (
@@ -40,6 +48,13 @@ from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 
 CURVE_POINTS = 60
+_PLACES: Mapping[str, str] = MappingProxyType(
+    {
+        MJLAB: "--mjlab the python of where mjlab is",
+        FAST_TD3: "--fast-td3 the folder of its checkout",
+    }
+)
+"""What has to be given for a peer that is not a package of this environment."""
 
 
 class Benchmark:
@@ -91,8 +106,12 @@ class Benchmark:
         if rate is None:
             return {"repeat": repeat, "failed": failure or "too few reports"}
         summary = {"steps_per_s": rate, "command_s": command_s, "env_steps": curve[-1][1]}
-        kept = curve[:: max(1, len(curve) // CURVE_POINTS)]
-        return {"repeat": repeat, "summary": summary, "curve": kept}
+        return {
+            "repeat": repeat,
+            "summary": summary,
+            "curve": _thinned(curve),
+            "returns": _thinned(side.returns(folder)),
+        }
 
     def _command(
         self, side: Side, words: Sequence[str], folder: Path, *, is_short: bool = False
@@ -120,7 +139,7 @@ class Benchmark:
 def main() -> int:
     """Measures what the command line asks for; returns 1 if a run failed, else 0."""
     given = _options()
-    sides = list(wanted_sides(given.only or [], tuple(given.overrides), given.mjlab))
+    sides = list(wanted_sides(given.only or [], tuple(given.overrides), _places(given)))
     if not sides:
         return 1
     with tempfile.TemporaryDirectory() as scratch:
@@ -135,11 +154,11 @@ def main() -> int:
 
 
 def wanted_sides(
-    only: Sequence[str], more: tuple[str, ...], mjlab: str | None = None
+    only: Sequence[str], more: tuple[str, ...], places: Mapping[str, str] = MappingProxyType({})
 ) -> Iterator[Side]:
     """Both sides of the comparisons with one of `only` in the name, of those to be had here.
 
-    `mjlab` is the interpreter of an environment that has it.
+    `places` says of peers that are not packages of this environment where they are, see `Side`.
 
     Raises:
       ConfigError: no comparison has that in its name, or an override is wrong.
@@ -153,12 +172,24 @@ def wanted_sides(
         if package := missing_package(COMPARISONS[name], more):
             sys.stderr.write(f"{name}: left out, the package {package} is not installed\n")
             continue
-        if peer == MJLAB and mjlab is None:
-            sys.stderr.write(f"{name}: left out, give --mjlab the python of where mjlab is\n")
+        if peer in _PLACES and peer not in places:
+            sys.stderr.write(f"{name}: left out, give {_PLACES[peer]}\n")
             continue
-        for side in (Side(name, trainer, more, mjlab or "") for trainer in (OURS, peer)):
+        for side in (Side(name, trainer, more, places.get(peer, "")) for trainer in (OURS, peer)):
             _ = side.told  # Composes it, so that a wrong override is found now.
             yield side
+
+
+def _thinned(points: list[Any]) -> list[Any]:
+    return points[:: max(1, len(points) // CURVE_POINTS)]
+
+
+def _places(given: argparse.Namespace) -> dict[str, str]:
+    """Where the peers are, of those that were given; FastTD3's folder has to have its script."""
+    if given.fast_td3 and not (given.fast_td3 / "fast_td3" / "train.py").is_file():
+        raise ConfigError(f"--fast-td3={given.fast_td3}: has no fast_td3/train.py")
+    places = {MJLAB: given.mjlab, FAST_TD3: given.fast_td3}
+    return {peer: str(place) for peer, place in places.items() if place}
 
 
 def _options() -> argparse.Namespace:
@@ -169,6 +200,9 @@ def _options() -> argparse.Namespace:
     )
     parser.add_argument(
         "--mjlab", metavar="PYTHON", help="interpreter of an environment with mjlab"
+    )
+    parser.add_argument(
+        "--fast-td3", type=Path, metavar="FOLDER", help="checkout of younggyoseo/FastTD3"
     )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--timeout-s", type=float, default=600.0, help="seconds for a run")

@@ -11,7 +11,7 @@ from gmijax.cli.compose import compose
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, PpoConfig, TrainConfig
 from gmijax.errors import ConfigError
 
-OURS, BRAX, MJLAB = "gmijax", "Brax", "mjlab"
+OURS, BRAX, MJLAB, FAST_TD3 = "gmijax", "Brax", "mjlab", "FastTD3"
 MJLAB_TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
 
 REPORTS = 10
@@ -22,13 +22,14 @@ class Comparison(NamedTuple):
     """One training, by `gmijax.train` and by another library.
 
     With Brax's PPO the environment is ours, which Brax gets through `make_env(..., api="brax")`,
-    or Brax's, or Playground's with the wrappers of its own script. mjlab trains a task of its own.
+    or Brax's, or Playground's with the wrappers of its own script. mjlab trains a task of its own,
+    and FastTD3 one of Playground's.
 
     Attributes:
       overrides: of `gmijax.train`. What the other is told is made from the same.
       unrolls: Brax cuts the T steps of an iteration into so many unrolls. What an iteration
         collects, a minibatch has and an epoch goes over is the same; advantages look less far.
-      peer: the other, `Brax` or `mjlab`.
+      peer: the other, `Brax`, `mjlab` or `FastTD3`.
     """
 
     overrides: tuple[str, ...]
@@ -109,6 +110,14 @@ COMPARISONS: Mapping[str, Comparison] = MappingProxyType(
         "anymal, and mjlab's Go1": Comparison(
             ("env=anymal", "physics.impl=warp", "num_envs=4096", "num_timesteps=10000000"),
             peer=MJLAB,
+        ),
+        # SAC with the settings of `configs/tuned/`, and TD3, on the same task: without pushes.
+        "Go1, off-policy": Comparison(
+            (
+                *("env=go1", "algo=sac", "physics.impl=warp", "env.settings.push=0"),
+                "num_timesteps=6000000",
+            ),
+            peer=FAST_TD3,
         ),
     }
 )
@@ -239,6 +248,7 @@ def missing_package(comparison: Comparison, more: tuple[str, ...] = ()) -> str |
     """The package that a comparison needs and that is not installed here."""
     impls = [one for one in (*comparison.overrides, *more) if one.startswith("physics.impl=")]
     needed = ["brax"] if comparison.peer == BRAX else []
-    needed += ["mujoco_playground"] if comparison.suite == "playground" else []
+    if comparison.suite == "playground" or comparison.peer == FAST_TD3:
+        needed += ["mujoco_playground"]
     needed += ["warp"] if impls[-1:] == ["physics.impl=warp"] else []
     return next((name for name in needed if importlib.util.find_spec(name) is None), None)

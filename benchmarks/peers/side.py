@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from benchmarks.peers.comparisons import (
     BRAX,
     COMPARISONS,
+    FAST_TD3,
     MJLAB,
     OURS,
     REPORTS,
@@ -19,11 +20,12 @@ from benchmarks.peers.comparisons import (
     case_name,
     mjlab_training,
 )
+from benchmarks.peers.fast_td3_flags import fast_td3_training
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.history import read_metrics
 
 _ROOT = Path(__file__).parents[2]
-_MODULES: Mapping[str, str] = {BRAX: "brax_ppo", MJLAB: "mjlab_ppo"}
+_MODULES: Mapping[str, str] = {BRAX: "brax_ppo", MJLAB: "mjlab_ppo", FAST_TD3: "fast_td3"}
 _WARM_REPORTS = 2  # The second part of a run by Brax may be compiled once more.
 _WARM_MEMORY = 0.05  # Of the GPU, for each of ours that compile at the same time.
 _SCRIPT_FLAGS: Mapping[str, str] = {
@@ -33,6 +35,13 @@ _SCRIPT_FLAGS: Mapping[str, str] = {
 }
 """What Brax's and Playground's training scripts tell XLA; Brax's too where the task is ours."""
 
+_OF_FAST_TD3: Mapping[str, str] = {
+    "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+    "JAX_DEFAULT_MATMUL_PRECISION": "highest",
+    "OMP_NUM_THREADS": "1",
+}
+"""What its script sets, too late for a process that has imported JAX and PyTorch."""
+
 
 class Side(NamedTuple):
     """A comparison's training by one of the two libraries.
@@ -41,13 +50,13 @@ class Side(NamedTuple):
       comparison: its name.
       trainer: `OURS`, or the comparison's `peer`.
       more: overrides of the command line, behind those of the comparison.
-      mjlab: interpreter of an environment with mjlab.
+      where: interpreter of an environment with mjlab, or folder of a checkout of FastTD3.
     """
 
     comparison: str
     trainer: str
     more: tuple[str, ...] = ()
-    mjlab: str = ""
+    where: str = ""
 
     def __str__(self) -> str:
         return case_name(self.comparison, self.trainer)
@@ -78,6 +87,8 @@ class Side(NamedTuple):
         variables = {"JAX_COMPILATION_CACHE_DIR": folder}
         if self.trainer == MJLAB:
             variables["PYTHONPATH"] = str(_ROOT)  # Not with the packages of this environment.
+        if self.trainer == FAST_TD3:
+            variables |= _OF_FAST_TD3
         if self.trainer == BRAX:
             suite = COMPARISONS[self.comparison].suite
             variables |= variables_of_brax(suite)
@@ -91,6 +102,14 @@ class Side(NamedTuple):
             lines = read_metrics(RunPaths(folder / "run").metrics)
             return [(line["wall_s"], line["env_steps"]) for line in lines]
         return [(seconds, steps) for seconds, steps in read_json(folder / "out.json")["curve"]]
+
+    def returns(self, folder: Path) -> list[tuple[float, float]]:
+        """Seconds, as in `curve`, and mean return of the latest episodes; empty: not told."""
+        if self.trainer == OURS:
+            lines = read_metrics(RunPaths(folder / "run").metrics)
+            told = [(line["wall_s"], line.get("return")) for line in lines]
+            return [(seconds, one) for seconds, one in told if one is not None]
+        return read_json(folder / "out.json").get("returns", [])
 
     @property
     def _overrides(self) -> tuple[str, ...]:
@@ -107,13 +126,17 @@ class Side(NamedTuple):
         if self.trainer == MJLAB:
             told = mjlab_training(comparison, self.more, seed=seed)
             return {**told, "iterations": 2} if is_short else told
+        if self.trainer == FAST_TD3:
+            more = (*self.more, "num_timesteps=1") if is_short else self.more
+            told = fast_td3_training(comparison, more, seed=seed)
+            return {**told, "checkout": self.where}
         reports = _WARM_REPORTS if is_short else REPORTS
         return brax_training(comparison, self.more, reports=reports, seed=seed)._asdict()
 
     def _by_peer(self, folder: Path, training: dict[str, Any]) -> list[str]:
         write_json(folder / "in.json", training)
         files = (str(folder / name) for name in ("in.json", "out.json"))
-        python = self.mjlab if self.trainer == MJLAB else sys.executable
+        python = self.where if self.trainer == MJLAB else sys.executable
         return [python, "-m", f"benchmarks.peers.{_MODULES[self.trainer]}", *files]
 
 

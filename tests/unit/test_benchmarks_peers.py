@@ -6,6 +6,7 @@ import argparse
 import importlib.util
 import inspect
 import json
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from brax.training.agents.ppo import networks, train
 
@@ -21,21 +23,23 @@ from benchmarks.evaluation.figures import NOT_MEASURED
 from benchmarks.evaluation.page import TABLES
 from benchmarks.evaluation.peer_tables import row
 from benchmarks.peers import __main__ as peers
-from benchmarks.peers import returns
+from benchmarks.peers import fast_td3, returns
 from benchmarks.peers.brax_ppo import replicated
 from benchmarks.peers.comparisons import (
     BRAX,
     COMPARISONS,
+    FAST_TD3,
     MJLAB,
     OURS,
     REPORTS,
     Comparison,
     brax_training,
 )
+from benchmarks.peers.fast_td3_flags import fast_td3_training
 from benchmarks.peers.side import Side
 from benchmarks.records import read_calls
 from gmijax.cli.compose import compose
-from gmijax.config import RolloutConfig
+from gmijax.config import RolloutConfig, SacConfig
 from gmijax.errors import ConfigError
 
 WITH_BRAX = [name for name, one in COMPARISONS.items() if one.peer == BRAX]
@@ -77,7 +81,7 @@ def test_a_short_training_has_the_same_parts():
 
 def test_mjlab_gets_as_many_environments_and_steps_and_no_packages_of_ours(tmp_path: Path):
     name = "anymal, and mjlab's Go1"
-    side = Side(name, MJLAB, ("num_envs=1024",), mjlab="/mjlab/bin/python")
+    side = Side(name, MJLAB, ("num_envs=1024",), where="/mjlab/bin/python")
     assert (side.told["num_envs"], side.told["iterations"]) == (1024, round(10e6 / 1024 / 24))
     words = side.short_command(tmp_path, has_gpu=True)
     assert words[:3] == ["/mjlab/bin/python", "-m", "benchmarks.peers.mjlab_ppo"]
@@ -85,6 +89,78 @@ def test_mjlab_gets_as_many_environments_and_steps_and_no_packages_of_ours(tmp_p
     assert Path(side.variables(tmp_path, is_short=False)["PYTHONPATH"], "benchmarks").is_dir()
     cells = row({}, name)
     assert (cells[1], cells[4]) == ("mjlab", "another task")
+
+
+OFF_POLICY = "Go1, off-policy"
+
+
+def test_fast_td3_draws_as_many_transitions_for_each_that_it_makes(tmp_path: Path):
+    config = compose(*COMPARISONS[OFF_POLICY].overrides)
+    assert isinstance(config.algo, SacConfig)
+    side = Side(OFF_POLICY, FAST_TD3, where="/FastTD3")
+    flags = side.told["flags"]
+    assert flags["num-envs"] == config.num_envs
+    assert flags["batch-size"] * flags["num-updates"] == 8 * flags["num-envs"]
+    assert flags["num-updates"] == config.algo.updates_per_step
+    assert flags["policy-frequency"] == config.algo.policy_every
+    assert flags["total-timesteps"] == round(6e6 / 4096)
+    assert (flags["critic-hidden-dim"], flags["actor-hidden-dim"]) == (768, 512)
+    assert (flags["env-name"], flags["amp"]) == ("Go1JoystickFlatTerrain", True)
+    assert config.env.settings["push"] == 0
+    words = side.short_command(tmp_path, has_gpu=True)
+    assert words[:3] == [sys.executable, "-m", "benchmarks.peers.fast_td3"]
+    told = json.loads(Path(words[3]).read_text())
+    assert (told["checkout"], told["impl"]) == ("/FastTD3", "warp")
+    # Learning has begun, so that its programs are compiled too.
+    assert told["flags"]["total-timesteps"] > flags["learning-starts"] + 2
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("algo=ppo", "algo=ppo: FastTD3 is compared with sac"),
+        ("algo.batch_size=5000", "as many from each of num_envs=4096"),
+        ("algo.critic_hidden_layer_sizes=[512,512]", "FastTD3 has three layers"),
+    ],
+)
+def test_what_fast_td3_has_no_flag_for_is_told(override: str, message: str):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        fast_td3_training(COMPARISONS[OFF_POLICY], (override,))
+
+
+def test_fast_td3_needs_its_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    assert not list(peers.wanted_sides([OFF_POLICY], ()))
+    assert "give --fast-td3 the folder of its checkout" in capsys.readouterr().err
+    sides = list(peers.wanted_sides([OFF_POLICY], (), {FAST_TD3: "/FastTD3"}))
+    assert [side.trainer for side in sides] == [OURS, FAST_TD3]
+    monkeypatch.setattr(sys, "argv", ["peers", "--fast-td3", str(tmp_path)])
+    with pytest.raises(ConfigError, match=r"has no fast_td3/train\.py"):
+        peers.main()
+
+
+def test_the_curve_of_fast_td3_counts_all_environments_and_ended_episodes(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    clock_s = iter(range(10))
+    monkeypatch.setattr(fast_td3.time, "monotonic", lambda: float(next(clock_s)))
+    curve = fast_td3.Curve(num_envs=2, rounds=2 * fast_td3.POINTS)
+    for ended, returned in [
+        ([0, 1], [5, 4]),
+        ([0, 0], [6, 1]),
+        ([0, 0], [7, 2]),
+        ([1, 1], [8, 3]),
+    ]:
+        curve.add(np.array(ended), np.array(returned))
+    assert curve.points == [(1.0, 4), (2.0, 8)]
+    assert curve.returns == [(1.0, 4.0), (2.0, 5.5)]
+
+
+def test_flags_of_fast_td3_are_words():
+    told = fast_td3.words({"num-envs": 4, "amp": True, "use-wandb": False})
+    assert told == ["--num-envs", "4", "--amp", "--no-use-wandb"]
 
 
 def test_overrides_change_both_sides_and_bad_ones_are_told():
@@ -183,7 +259,10 @@ class Fake:
         if "gmijax.train" in told:
             folder = Path(told[-1].removeprefix("run.dir="))
             folder.mkdir()
-            lines = [json.dumps({"wall_s": 0.5 * s, "env_steps": steps}) for s, steps in points]
+            lines = [
+                json.dumps({"wall_s": 0.5 * s, "env_steps": steps, "return": 2.0})
+                for s, steps in points
+            ]
             (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
         else:
             Path(told[-1]).write_text(json.dumps({"curve": points}))
@@ -213,6 +292,8 @@ def test_both_sides_run_in_turn_and_are_kept(tmp_path: Path, monkeypatch: pytest
     rates = [own[0]["summary"]["steps_per_s"] for own in runs]
     assert rates == pytest.approx([200.0, 100.0])
     assert runs[0][0]["summary"]["command_s"] == 60.0
+    assert runs[0][0]["returns"][0] == (5.5, 2.0)
+    assert runs[1][0]["returns"] == []  # Of rates alone.
     assert not made.has_failed
     kept = read_calls(made.file.path)[-1].results
     assert kept == json.loads(json.dumps(made.file.results))
