@@ -15,7 +15,9 @@ from gmijax.cli.compose import build, defaults
 from gmijax.cli.grid import SweepHelp, build_sweep
 from gmijax.cli.groups import choices
 from gmijax.cli.help import print_help
+from gmijax.config import ServeConfig, TrainConfig
 from gmijax.config.schema import to_dict
+from gmijax.control.console import open_console
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.errors import ConfigError
 from gmijax.sweeps.sweep import SweepWork, run_sweep
@@ -53,7 +55,9 @@ def command(
         if show:
             sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(dict(shown(made)))))
         else:
-            run(made, show="verbose" if verbose else True)
+            console = open_console(show="verbose" if verbose else True)
+            console.opening = _task_nobody_chose(made, overrides)
+            run(made, show=console)
 
     return exit_code_of(name, whole)
 
@@ -67,6 +71,21 @@ def _shown_sweep(work: SweepWork) -> dict[str, Any]:
     jobs = [dict(job.overrides) for job in work.jobs]
     nodes = {"cluster": to_dict(work.cluster)} if work.cluster.engine else {}
     return {"sweep": to_dict(work.settings), **nodes, "jobs": jobs}
+
+
+def _task_nobody_chose(made: Any, overrides: Sequence[str]) -> str | None:
+    """Names the task of a job for which neither the command line nor a run chooses one."""
+    config = made.jobs[0].config if isinstance(made, SweepWork) and made.jobs else made
+    if isinstance(config, TrainConfig):
+        run = None if config.run.resume == "auto" else config.run.resume
+    elif isinstance(config, ServeConfig):
+        run = config.run.dir
+    else:
+        return None
+    if run is not None or any(text.lstrip("+").startswith("env=") for text in overrides):
+        return None
+    others = "choose another with env=NAME (gmijax list-envs shows them)"
+    return f"task: {config.env.label}, the default; {others}"
 
 
 def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:

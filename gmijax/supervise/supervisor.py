@@ -143,7 +143,8 @@ class Supervisor:
             what = f"made no progress after iteration {iteration}; GMI {cause.gmi} {cause.reason}"
             raise GmiFailed(stuck.gmi, what, iteration=iteration)
         if cause.error is not None and ended_with(cause, ConfigError):
-            raise ConfigError(first_line(cause.error.message))  # Bad input stays bad input.
+            # Bad input stays bad input; the end of its line has the place.
+            raise ConfigError(first_line(cause.error.message, None))
         raise cause
 
     def _poll_failures(self) -> list[GmiFailed]:

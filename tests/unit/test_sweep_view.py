@@ -139,7 +139,7 @@ def test_a_value_of_a_window_that_is_not_full_is_marked_where_it_is_shown() -> N
         view.update()
     # Nothing is overridden: there is nothing to say of it.
     assert said.getvalue().startswith("job 0: completed after ")
-    assert "s, return 8 (12 episodes, window not full); " in said.getvalue()
+    assert "s, return 8 (12 episodes, too few to compare); " in said.getvalue()
 
 
 @pytest.mark.parametrize("what", ["a terminal that is closed", "a row that cannot be made"])

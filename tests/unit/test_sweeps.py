@@ -468,7 +468,7 @@ def test_the_ranking_has_full_windows_first_and_jobs_without_a_value_below(
     assert "".join(row[1] for row in rows) == order
     assert [row[0] for row in rows] == ["1", "2", "3", "4", "-"]
     found = {row[1]: row[3] for row in rows}
-    assert found["1"] == "-5 (12 episodes, window not full)"
+    assert found["1"] == "-5 (12 episodes, too few to compare)"
     assert (found["2"], found["3"]) == ("3", "-")
     report = read_json(tmp_path / "sweep.json")
     assert report["ranking"] == [int(number) for number in order[:4]]
@@ -493,7 +493,7 @@ def test_settings_come_first_with_the_interquartile_mean_of_their_seeds(tmp_path
     assert [row[1:] for row in settings] == [
         ["algo.learning_rate=0.0002", "21.5", "20.75 to 22.25", "4"],
         ["algo.learning_rate=0.0001", "11.5", "10.75 to 31.5", "4"],
-        ["algo.learning_rate=0.0003", "50 (windows not full)", "50 to 50", "3 of 4"],
+        ["algo.learning_rate=0.0003", "50 (too few episodes to compare)", "50 to 50", "3 of 4"],
     ]
     first = read_json(tmp_path / "sweep.json")["settings"][0]
     assert first["overrides"] == {"algo.learning_rate": "0.0002"}
