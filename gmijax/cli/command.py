@@ -96,7 +96,7 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
     if "--cfg" in arguments:
         at = arguments.index("--cfg")
         if arguments[at + 1 : at + 2] != ["job"]:
-            raise ConfigError(f"--cfg {' '.join(arguments[at + 1 : at + 2])}: allowed is job")
+            raise ConfigError(f"--cfg {' '.join(arguments[at + 1 : at + 2])}: allowed: job")
         del arguments[at : at + 2]
         show = True
     for text, after in zip_longest(arguments, arguments[1:], fillvalue="-"):
@@ -106,5 +106,5 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
                 equals, value = "=", after  # `--num-envs 64`, as others have it.
             meant = f"; did you mean {key.replace('-', '_')}={value}?" if key and equals else ""
             allowed = "--help, --verbose, --cfg job, key=value"
-            raise ConfigError(f"unknown option {text}: allowed are {allowed}{meant}")
+            raise ConfigError(f"unknown option {text}; allowed: {allowed}{meant}")
     return arguments, show, verbose

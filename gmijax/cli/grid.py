@@ -141,7 +141,7 @@ def values_of(item: Override) -> Choices | Interval:
     if len(found) > MAX_JOBS:
         raise _too_many(item)
     if len(set(found)) < len(found):
-        raise ConfigError(f"{item.input_line}: a value that comes twice")
+        raise ConfigError(f"{item.input_line}: a value is repeated")
     return Choices(tuple(found))
 
 

@@ -145,6 +145,6 @@ def what_is_left(config: TrainConfig, run: RunPaths) -> str:
     if not read_metrics(run.metrics):
         return "there is no checkpoint"
     return (
-        "there is no checkpoint: run.stop_timeout_s is the time that GMIs get to save one, after "
-        "Ctrl-C run.stall_timeout_s"
+        "no checkpoint was saved: GMIs have run.stop_timeout_s for that, after Ctrl-C "
+        "run.stall_timeout_s"
     )

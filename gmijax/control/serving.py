@@ -309,7 +309,7 @@ def _output(job: _ServingJob, kept: int) -> dict[str, Any] | None:
 
 def _what_is_left(job: _ServingJob) -> str:
     if job.data is None:
-        return "nothing was to be written"
+        return "no output was asked for"
     done = job.finished_unrolls()
     return (
         f"{done} of {job.wanted_unrolls} shards are in {job.data.root}; "

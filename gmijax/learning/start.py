@@ -214,7 +214,7 @@ def begin_episodes(
         fewer = f"{kept_key} up to {most_steps}, or " if most_steps > 0 else ""
         raise ConfigError(
             f"num_envs={num_envs}: a GMI would need more than {need} for {them} and {kept_steps} "
-            f"steps of each ({kept_key}), and has {have}; allowed are {fewer}num_envs less than "
+            f"steps of each ({kept_key}), and has {have}; allowed: {fewer}num_envs less than "
             f"{int(limit_bytes * num_envs / least_bytes)}"
         )
     starts = env_keys(key, first_env, num_envs)

@@ -39,7 +39,7 @@ def test_more_environments_than_memory_holds_are_refused_before_there_is_one(
 
 def test_what_fits_is_told_and_is_taken(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(start, "detect_host", lambda: HostLimits(memory_mib=1))
-    with pytest.raises(ConfigError, match=r"allowed are .*num_envs less than") as refused:
+    with pytest.raises(ConfigError, match=r"allowed: .*num_envs less than") as refused:
         begin(10**6)
     most = int(str(refused.value).rpartition(" ")[2])
     begin(most - 1)

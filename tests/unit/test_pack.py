@@ -94,7 +94,7 @@ def test_keys_that_hold_text_need_no_quotes_of_hydra() -> None:
         (("pack.resume=--x 'a",), ("true",), "pack.resume=--x 'a: No closing quotation"),
         (("seed=0,1",), ("true", "{sed}", "{seed}"), r"\{sed\}: no such placeholder.*seed"),
         (("job=0,1",), ("true", "{job}"), r"job=: every job has \{job\} of its own"),
-        (("seed=0,0",), COMMAND, "a value that comes twice"),
+        (("seed=0,0",), COMMAND, "a value is repeated"),
         (("seed=0", "seed=1"), COMMAND, "comes twice"),
         (("pack.rate=fps",), ("true",), "pack.rate=fps: has 0 groups"),
         (("pack.rate=(",), ("true",), r"pack.rate=\(: no regular expression"),

@@ -180,7 +180,7 @@ def test_more_time_is_advised_where_nothing_ended_in_time_and_only_there(profile
         raise ProfileLate(f"{point} is slow")
 
     profiles(late)
-    advice = "; give more search.budget_s, or smaller sizes in search.num_envs"
+    advice = "; raise search.budget_s, or use smaller sizes in search.num_envs"
     with pytest.raises(GmijaxError, match=rf"no point of the search can run; .* is slow{advice}$"):
         found()
     profiles(lambda point: NotRunnable(f"{point} has no room"))

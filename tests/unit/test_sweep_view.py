@@ -161,7 +161,7 @@ def test_an_error_of_the_view_ends_the_view_alone(
         view.update()
     assert terminal.getvalue() == before
     if what == "a row that cannot be made":
-        assert before.count("no progress from here on: ValueError") == 1
+        assert before.count("progress is no longer shown: ValueError") == 1
 
 
 def test_overrides_and_value_of_a_job_are_there_for_the_hparams_tab(tmp_path: Path) -> None:
