@@ -185,7 +185,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "run.dir=.", "the run folder exists already"),
     ("train", "run.resume=nowhere", "run.resume=nowhere: no such folder"),
     ("train", "run.resume=last", "no run with a checkpoint"),
-    ("train", "run.resume=auto", "run.resume=auto: needs run.dir or run.name, the folder to go"),
+    ("train", "run.resume=auto", "run.resume=auto: needs run.dir or run.name, the folder to co"),
     ("serve", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
     ("serve", "", "run.dir=last: no run with a checkpoint in runs/"),
     ("serve", "run.dir=null", "policy=trained: needs run.dir=RUN"),
@@ -213,7 +213,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("search", f"{A3C} plan.serving_gpus=1", "plan.training_gpus=null: there must be serving"),
     ("search", f"{A3C} plan.layout=[[0],[1]]", "plan.layout=[[0], [1]]: with the decoupled"),
     # What is hardly a command line.
-    ("train", "-env=\n", "unknown option -env=\\n: allowed"),
+    ("train", "-env=\n", "unknown option -env=\\n; allowed"),
     ("train", "\r", r"'\r': expected text without control characters"),
     ("train", "run.name=lr=3e-4", "run.name=lr=3e-4: not a value; text with such characters"),
     ("train", "run.dir=runs/(v2)", """needs quotes: "run.dir='runs/(v2)'\""""),

@@ -95,7 +95,7 @@ def test_keys_that_hold_text_need_no_quotes_of_hydra() -> None:
         (("seed=0,1",), ("true", "{sed}", "{seed}"), r"\{sed\}: no such placeholder.*seed"),
         (("job=0,1",), ("true", "{job}"), r"job=: every job has \{job\} of its own"),
         (("seed=0,0",), COMMAND, "a value is repeated"),
-        (("seed=0", "seed=1"), COMMAND, "comes twice"),
+        (("seed=0", "seed=1"), COMMAND, "grid is repeated"),
         (("pack.rate=fps",), ("true",), "pack.rate=fps: has 0 groups"),
         (("pack.rate=(",), ("true",), r"pack.rate=\(: no regular expression"),
         (("pack.copies=2", "seed=0,1"), COMMAND, "pack.copies: not with a grid"),
