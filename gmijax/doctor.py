@@ -90,7 +90,7 @@ def parse(argv: Sequence[str]) -> DoctorOptions:
             options = options._replace(cluster=value)
         else:
             raise ConfigError(
-                f"{text}: allowed are --json, --verbose, mig=SIZES (e.g. mig=3g,2g,1g,1g), "
+                f"{text}: expected one of --json, --verbose, mig=SIZES (e.g. mig=3g,2g,1g,1g), "
                 "gpu=INDEX, cluster=ADDRESS, --help"
             )
     if options.mig is None and options.gpu is not None:

@@ -45,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
 
 def _list(argv: Sequence[str]) -> None:
     if argv:
-        raise ConfigError(f"{argv[0]}: allowed is --help")
+        raise ConfigError(f"{argv[0]}: allowed: --help")
     table = Table(box=None, pad_edge=False)
     table.add_column("env", no_wrap=True)
     for heading in ("observations", "actions", "steps"):

@@ -158,5 +158,5 @@ def _described(product: Product) -> str:
     m, k, n = product.size
     return (
         f"{product.precision.name} [{m}, {k}] x [{k}, {n}] with relative error "
-        f"{product.error:.2g}, allowed is {product.precision.tolerance:.2g}"
+        f"{product.error:.2g}, the limit is {product.precision.tolerance:.2g}"
     )

@@ -148,5 +148,5 @@ def _figure(reference: str, form: str) -> str:
 
 def _table(name: str) -> str:
     if name not in TABLES:
-        raise ConfigError(f"table {name}: allowed are {', '.join(sorted(TABLES))}")
+        raise ConfigError(f"table {name}: expected one of {', '.join(sorted(TABLES))}")
     return "\n".join(TABLES[name]()) + "\n"

@@ -98,7 +98,7 @@ def environment(training: BraxTraining) -> tuple[Any, dict[str, Any]]:
         own = playground.registry.get_default_config(training.env).episode_length
         wrap = playground.wrapper.wrap_for_brax_training
         return env, {"episode_length": length or own, "wrap_env_fn": wrap}
-    raise ConfigError(f"suite={training.suite}: allowed are gmijax, brax, playground")
+    raise ConfigError(f"suite={training.suite}: expected one of gmijax, brax, playground")
 
 
 def replicated(tree: PyTree, devices: Sequence[Any]) -> PyTree:

@@ -95,6 +95,6 @@ def _until(limit_s: float, on_tick: OnTick) -> OnTick:
         on_tick(gmis)
         if running_s() > deadline_s:
             states = ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
-            raise ProfileLate(f"no end within {limit_s:.0f} s ({states})")
+            raise ProfileLate(f"did not end within {limit_s:.0f} s ({states})")
 
     return watch

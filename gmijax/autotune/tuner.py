@@ -215,7 +215,7 @@ class Search:
                 raise OutOfBudget from None
             return NotRunnable(str(late), limit_s)
         except JobInterrupted as error:
-            error.add_note(f"the same search goes on from {self._store.path}")
+            error.add_note(f"the same search continues from {self._store.path}")
             raise
 
     def _require_best(self, outcome: SearchOutcome) -> SearchPoint:
@@ -223,15 +223,15 @@ class Search:
             return outcome.best
         if not outcome.visited:
             raise ConfigError(
-                f"search.budget_s={self._settings.budget_s:g}: too small for one profile; give "
-                "more, or smaller sizes in search.num_envs"
+                f"search.budget_s={self._settings.budget_s:g}: too small for one profile; raise "
+                "it, or use smaller sizes in search.num_envs"
             )
         first = outcome.visited[0]
         why = more = ""
         if isinstance(first.result, NotRunnable):
             why = first.result.reason
             if first.result.limit_s is not None:  # It was too slow.
-                more = "; give more search.budget_s, or smaller sizes in search.num_envs"
+                more = "; raise search.budget_s, or use smaller sizes in search.num_envs"
         raise GmijaxError(f"no point of the search can run; the first, {first.point}: {why}{more}")
 
 

@@ -155,7 +155,7 @@ class Messenger:
 
     def _check(self, rank: int, what: str) -> None:
         if not (isinstance(rank, int | np.integer) and 0 <= rank < self.world_size):
-            raise ConfigError(f"{what}={rank!r}: allowed are GMIs 0 to {self.world_size - 1}")
+            raise ConfigError(f"{what}={rank!r}: there are GMIs 0 to {self.world_size - 1}")
 
     def _inbox(self, src: int) -> Inbox:
         get = None if self._device is None else self._device.get

@@ -57,7 +57,23 @@ def quoted(value: str) -> str:
 
 def parse(overrides: Sequence[str]) -> list[Override]:
     """Overrides by Hydra's grammar; raises ConfigError."""
+    _require_joined(overrides)
     return [_parsed(text) for text in overrides]
+
+
+def _require_joined(words: Sequence[str]) -> None:
+    """Refuses blanks around `=`; without quotes a shell makes two or three words of that."""
+    for at, word in enumerate(words):
+        key, equals, value = word.partition("=")
+        parts = [word]
+        if equals and not key and at and "=" not in words[at - 1]:
+            key, parts = words[at - 1], [words[at - 1], *parts]
+        if equals and not value and "=" not in (after := "".join(words[at + 1 : at + 2])):
+            value, parts = after.removeprefix("~"), [*parts, after]
+        is_apart = len(parts) > 1 or key != key.rstrip()
+        if is_apart and key and value.strip():
+            joined = f"{key.rstrip()}={value.strip()}"
+            raise ConfigError(f"{' '.join(parts)}: write it without blanks: {joined}")
 
 
 def require_text(text: str) -> None:

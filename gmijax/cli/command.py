@@ -15,7 +15,9 @@ from gmijax.cli.compose import build, defaults
 from gmijax.cli.grid import SweepHelp, build_sweep
 from gmijax.cli.groups import choices
 from gmijax.cli.help import print_help
+from gmijax.config import ServeConfig, TrainConfig
 from gmijax.config.schema import to_dict
+from gmijax.control.console import open_console
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.errors import ConfigError
 from gmijax.sweeps.sweep import SweepWork, run_sweep
@@ -53,7 +55,9 @@ def command(
         if show:
             sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(dict(shown(made)))))
         else:
-            run(made, show="verbose" if verbose else True)
+            console = open_console(show="verbose" if verbose else True)
+            console.opening = _task_nobody_chose(made, overrides)
+            run(made, show=console)
 
     return exit_code_of(name, whole)
 
@@ -69,6 +73,21 @@ def _shown_sweep(work: SweepWork) -> dict[str, Any]:
     return {"sweep": to_dict(work.settings), **nodes, "jobs": jobs}
 
 
+def _task_nobody_chose(made: Any, overrides: Sequence[str]) -> str | None:
+    """Names the task of a job for which neither the command line nor a run chooses one."""
+    config = made.jobs[0].config if isinstance(made, SweepWork) and made.jobs else made
+    if isinstance(config, TrainConfig):
+        run = None if config.run.resume == "auto" else config.run.resume
+    elif isinstance(config, ServeConfig):
+        run = config.run.dir
+    else:
+        return None
+    if run is not None or any(text.lstrip("+").startswith("env=") for text in overrides):
+        return None
+    others = "choose another with env=NAME (gmijax list-envs shows them)"
+    return f"task: {config.env.label}, the default; {others}"
+
+
 def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
     """The overrides; whether only the configuration is to be shown; whether reasons are, too."""
     parts = [part for text in argv for part in re.split(r"^(--cfg)=", text) if part]
@@ -77,7 +96,7 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
     if "--cfg" in arguments:
         at = arguments.index("--cfg")
         if arguments[at + 1 : at + 2] != ["job"]:
-            raise ConfigError(f"--cfg {' '.join(arguments[at + 1 : at + 2])}: allowed is job")
+            raise ConfigError(f"--cfg {' '.join(arguments[at + 1 : at + 2])}: allowed: job")
         del arguments[at : at + 2]
         show = True
     for text, after in zip_longest(arguments, arguments[1:], fillvalue="-"):
@@ -87,5 +106,5 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
                 equals, value = "=", after  # `--num-envs 64`, as others have it.
             meant = f"; did you mean {key.replace('-', '_')}={value}?" if key and equals else ""
             allowed = "--help, --verbose, --cfg job, key=value"
-            raise ConfigError(f"unknown option {text}: allowed are {allowed}{meant}")
+            raise ConfigError(f"unknown option {text}; allowed: {allowed}{meant}")
     return arguments, show, verbose

@@ -77,7 +77,7 @@ def compose(*overrides: str, command: str = "train", env: Callable[..., Any] | N
     """
     chosen = () if env is None else (f"env={reference(env)}",)
     if command not in _COMPOSED:
-        raise ConfigError(f"command={command}: allowed are {', '.join(_COMPOSED)}")
+        raise ConfigError(f"command={command}: expected one of {', '.join(_COMPOSED)}")
     return build(command, _COMPOSED[command], (*chosen, *overrides))
 
 
@@ -216,7 +216,7 @@ def _check_override(name: str, item: Override) -> None:
         raise ConfigError(f"{item.input_line}: expected ~{key}")
     if options and not item.is_delete() and item.value() not in options:
         # Of a few the closest name is a guess: `algo=td3` is no slip for a3c.
-        hint = f": allowed are {', '.join(options)}" if len(options) < 5 else ""
+        hint = f": expected one of {', '.join(options)}" if len(options) < 5 else ""
         kind = {"env": " task", "algo": " algorithm"}.get(key, "")
         suite, colon, of_suite = str(item.value()).partition(":")
         if key == "env" and colon and suite in options:  # As labels and run folders have it.
@@ -285,7 +285,7 @@ def _on_top_of_saved(
             continue
         if item.is_delete() or choices(key):
             raise ConfigError(
-                f"{item.input_line}: a run that is resumed keeps its settings; "
+                f"{item.input_line}: a resumed run keeps its settings; "
                 "change single keys with key=value"
             )
         raise _unknown_key(key, flatten(data))

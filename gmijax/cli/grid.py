@@ -55,9 +55,9 @@ def build_sweep(overrides: Sequence[str]) -> SweepWork:
     fixed = [
         text for text, item in given if text not in own + nodes and not item.is_sweep_override()
     ]
-    settings = from_dict(SweepConfig, compose_dict("sweep", own)["sweep"])
+    settings = from_dict(SweepConfig, compose_dict("sweep", own)["sweep"], "sweep.")
     # Nodes are the sweep's; each job is a training on one machine.
-    cluster = from_dict(ClusterConfig, compose_dict("train", nodes)["cluster"])
+    cluster = from_dict(ClusterConfig, compose_dict("train", nodes)["cluster"], "cluster.")
     space = {item.key_or_group: values_of(item) for _, item in given if item.is_sweep_override()}
 
     config_of = _Composer(fixed, [key for key in space if choices(key)])
@@ -141,7 +141,7 @@ def values_of(item: Override) -> Choices | Interval:
     if len(found) > MAX_JOBS:
         raise _too_many(item)
     if len(set(found)) < len(found):
-        raise ConfigError(f"{item.input_line}: a value that comes twice")
+        raise ConfigError(f"{item.input_line}: a value is repeated")
     return Choices(tuple(found))
 
 

@@ -89,7 +89,7 @@ def build_pack(words: Sequence[str], program: Sequence[str]) -> PackWork:
     keys = from_dict(PackKeys, compose_dict("pack", readable("pack", own)))
     space = {item.key_or_group: _values(item) for text, item in given if text not in own}
     if len(space) < len(given) - len(own):
-        raise ConfigError("a name of the grid comes twice")
+        raise ConfigError("a name of the grid is repeated")
     folder = Folder(keys.run.dir, keys.run.name)
     return pack_of(keys.pack, space, program, folder, keys.cluster)
 
@@ -125,7 +125,7 @@ def _values(item: Override) -> Choices | Interval:
 
 def _distinct(item: Override, values: Sequence[str]) -> tuple[str, ...]:
     if len(set(values)) < len(values):
-        raise ConfigError(f"{item.input_line}: a value that comes twice")
+        raise ConfigError(f"{item.input_line}: a value is repeated")
     return tuple(values)
 
 

@@ -102,7 +102,7 @@ class RayCluster:
             if is_over:
                 raise self._too_few(gpus, wanted, num_cpus, least_gpus)
             if is_unwanted():
-                raise JobInterrupted("stopped while it waited for nodes")
+                raise JobInterrupted("stopped while waiting for nodes")
             time.sleep(_POLL_S)
         num_nodes = min(len(gpus), wanted or len(gpus))
         bundle = {"CPU": num_cpus} | ({"GPU": few} if (few := gpus[num_nodes - 1]) else {})

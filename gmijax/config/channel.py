@@ -38,7 +38,7 @@ class ChannelConfig(KeyGroup):
     def why_not_device(self) -> str | None:
         """None if these settings go with `transport=device`, else the reason."""
         if self.design != "multi":
-            return f"not with channel.design={self.design}; allowed is multi"
+            return f"not with channel.design={self.design}; allowed: multi"
         return None
 
     @property

@@ -46,5 +46,5 @@ class ClusterConfig(KeyGroup):
         if self.address.startswith("ray://"):
             raise ConfigError(
                 f"cluster.address={self.address}: a job must be started on a node of the cluster, "
-                "for example by `ray job submit`; allowed are auto, local, host:port"
+                "for example by `ray job submit`; allowed: auto, local, host:port"
             )

@@ -118,7 +118,7 @@ class PlanConfig(KeyGroup):
         names = ("auto", *allowed)
         if self.template not in names:
             raise ConfigError(
-                f"plan.template={self.template}: not for {why}; allowed are {', '.join(names)}"
+                f"plan.template={self.template}: not for {why}; allowed: {', '.join(names)}"
             )
 
 

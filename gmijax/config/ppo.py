@@ -57,6 +57,6 @@ class PpoConfig(ActorCriticConfig):
         if self.recompute_advantages and plan.template == "tdg_ex":
             raise ConfigError(
                 "algo.recompute_advantages=true: for jobs in which every GMI trains; with "
-                "plan.template=tdg_ex allowed is false"
+                "plan.template=tdg_ex must be false"
             )
         super().check_job(num_envs, plan)

@@ -72,7 +72,9 @@ class RunConfig(Timeouts):
                 f"run.dir={self.dir}: expected the path of a folder; mount what is elsewhere"
             )
         if self.resume == "auto" and self.dir is None and self.name is None:
-            raise ConfigError("run.resume=auto: needs run.dir or run.name, the folder to go on in")
+            raise ConfigError(
+                "run.resume=auto: needs run.dir or run.name, the folder to continue in"
+            )
         _ = self.profiled
 
     @property

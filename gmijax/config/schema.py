@@ -169,10 +169,10 @@ def flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def suggestion(key: str, allowed: typing.Iterable[str]) -> str:
-    """`: did you mean ...` where a name is close, else `: allowed are ...`."""
+    """`: did you mean ...` where a name is close, else `; allowed: ...`."""
     names = sorted(allowed)
     close = difflib.get_close_matches(key, names, n=1)
-    return f": did you mean {close[0]}?" if close else f": allowed are {', '.join(names)}"
+    return f": did you mean {close[0]}?" if close else f"; allowed: {', '.join(names) or 'none'}"
 
 
 def _has_default(cls: Any, key: str) -> bool:
@@ -192,9 +192,8 @@ def _convert(kind: Any, value: Any, key: str) -> Any:
         converted = _accept(option, value, key)
         if converted is not _REJECTED:
             return converted
-    raise ConfigError(
-        f"{key}={_shown(value)}: expected {_describe(kind)}{_in_digits(kind, value)}"
-    )
+    meant = _in_digits(kind, value) + _as_sweep(kind, value, key)
+    raise ConfigError(f"{key}={_shown(value)}: expected {_describe(kind)}{meant}")
 
 
 def _in_digits(kind: Any, value: Any) -> str:
@@ -204,6 +203,23 @@ def _in_digits(kind: Any, value: Any) -> str:
         return ""
     return f"; did you mean {match[1]}e{_POWERS[match[2].lower()]}?"
 
+
+def _as_sweep(kind: Any, value: Any, key: str) -> str:
+    """`0:3` or `0-2` as several values, where one number is expected."""
+    text = value if isinstance(value, str) else ""
+    match = re.fullmatch(r"(\d{1,12})(:|-|\.\.)(\d{1,12})", text)
+    if match is None or not {int, float} & set(_options(kind)) or key.startswith(_ONCE):
+        return ""
+    first, end = int(match[1]), int(match[3]) + (match[2] != ":")
+    if end - first < 2:
+        return ""
+    few = ",".join(str(number) for number in range(first, min(end, first + 3)))
+    more = ",..." if end - first > 3 else ""
+    return f"; for several: gmijax sweep {key}={few}{more} or '{key}=range({first},{end})'"
+
+
+_ONCE = ("run.", "sweep.", "pack.", "cluster.")
+"""Beginnings of keys that a sweep has once, and not for each job."""
 
 _POWERS = types.MappingProxyType({"k": 3, "m": 6, "g": 9, "b": 9})
 

@@ -50,7 +50,7 @@ class SearchConfig(KeyGroup):
             if not values or len(set(values)) != len(values):
                 raise ConfigError(f"search.{key}={list(values)}: expected distinct numbers")
         if bad := [impl for impl in self.impls if impl not in ("jax", "warp")]:
-            raise ConfigError(f"search.impls={bad[0]}: allowed are jax, warp")
+            raise ConfigError(f"search.impls={bad[0]}: expected one of jax, warp")
         if len(set(self.impls)) != len(self.impls):
             raise ConfigError(f"search.impls={list(self.impls)}: expected distinct names")
         if not self.budget_s >= SHORTEST_BUDGET_S:  # Not a number is refused too.

@@ -66,7 +66,7 @@ class JobsConfig(KeyGroup):
             raise ConfigError(f"{key}trials={self.trials}: {key}sampler=grid runs all of them")
         if self.sampler == "grid" and self.pruner != "none":
             raise ConfigError(
-                f"{key}pruner={self.pruner}: not with {key}sampler=grid; allowed are random, tpe"
+                f"{key}pruner={self.pruner}: not with {key}sampler=grid; allowed: random, tpe"
             )
 
 

@@ -52,7 +52,7 @@ class TrainConfig(KeyGroup):
         if self.eval.every is not None and self.is_decoupled:
             raise ConfigError(
                 f"eval.every={self.eval.every}: with algo={self.algo.name} agents act all the "
-                "time, and nobody evaluates; allowed is null (gmijax.play evaluates a checkpoint)"
+                "time, and nobody evaluates; allowed: null (gmijax.play evaluates a checkpoint)"
             )
         num_envs = None if self.num_envs == "auto" else self.num_envs
         self.algo.check_job(num_envs, self.plan)
@@ -75,7 +75,7 @@ class TrainConfig(KeyGroup):
         if self.plan.template not in (allowed := ("auto", "tcg_ex", "decoupled")):
             raise ConfigError(
                 f"plan.template={self.plan.template}: not with "
-                f"cluster.engine={self.cluster.engine} yet; allowed are {', '.join(allowed)}"
+                f"cluster.engine={self.cluster.engine} yet; allowed: {', '.join(allowed)}"
             )
         for key, value in (
             ("num_envs", self.num_envs),

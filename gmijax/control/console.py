@@ -18,9 +18,6 @@ from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.names import nearby
 
-Show: TypeAlias = bool | Literal["verbose"]
-"""Whether a command prints what it does; verbose: also why it decided so."""
-
 SMALL_TASK: Final = "ball_balance"
 """What two cores of a CPU learn within minutes; other tasks take hours there."""
 
@@ -72,13 +69,28 @@ class UserConsole(Console):
 
     Attributes:
       is_verbose: whether the reasons of decisions are printed too.
+      opening: a line that comes before all others, and not where there are none.
     """
 
     is_verbose = False
+    opening: str | None = None
+
+    def print(self, *objects: Any, **named: Any) -> None:
+        """See `Console`."""
+        opening, self.opening = self.opening, None
+        if opening is not None:
+            super().print(opening)
+        super().print(*objects, **named)
+
+
+Show: TypeAlias = bool | Literal["verbose"] | UserConsole
+"""Whether a command prints what it does; verbose: also why it decided so; or where it prints."""
 
 
 def open_console(*, show: Show) -> UserConsole:
     """Where a job prints what the user may read: standard output, or nowhere."""
+    if isinstance(show, UserConsole):
+        return show
     # Without a standard output (`>&-`) it is None.
     stream: Any = _BestEffortStream(sys.stdout if show else None)
     is_shown_live = stream.isatty() and os.environ.get("TERM") != "dumb"

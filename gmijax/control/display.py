@@ -70,7 +70,7 @@ class LiveDisplay:
             if not was_off:
                 self.__exit__()
                 with suppress(Exception):
-                    self._console.print(f"no progress from here on: {error!r}")
+                    self._console.print(f"progress is no longer shown: {error!r}")
 
 
 def bar(part: float, width: int = _BAR_WIDTH) -> Text:

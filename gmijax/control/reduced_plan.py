@@ -31,7 +31,7 @@ def with_gpus_left(
     num_left = plan.layout.num_gpus - len(lost)
     gone = f"GPUs {sorted(lost)} of the job are gone"
     if not config.run.elastic:
-        raise ConfigError(f"{gone}; run.elastic=true would go on with the {num_left} left")
+        raise ConfigError(f"{gone}; run.elastic=true would continue with the {num_left} left")
     if num_left == 0:
         raise ConfigError(f"{gone}, and no other one is left")
     if config.is_decoupled and config.plan.serving_gpus is not None:

@@ -94,7 +94,7 @@ class Attempts:
                     if _steps(newest) > reached:
                         budget, reached = self.max_restarts, _steps(newest)
                     if reason is None and budget == 0:
-                        reason = f"restarts are used up (run.max_restarts={self.max_restarts})"
+                        reason = f"no restarts are left (run.max_restarts={self.max_restarts})"
                     if reason is not None or signals.have_come:
                         self._give_up(error, reason)
                         raise

@@ -12,12 +12,19 @@ from typing import Any, NamedTuple
 
 from gmijax.config import TrainConfig
 from gmijax.control.console import nearby
-from gmijax.control.start_point import StartPoint
+from gmijax.control.start_point import StartPoint, has_trained
 from gmijax.control.summary import train_summary
 from gmijax.partition.plan import Plan
-from gmijax.runs.folder import RunPaths, add_event, read_json, remove_temporary, write_json
+from gmijax.runs.folder import (
+    RunPaths,
+    add_event,
+    given_run,
+    read_json,
+    remove_temporary,
+    write_json,
+)
 from gmijax.runs.git import record_git
-from gmijax.runs.held import OpenFolder, locked
+from gmijax.runs.held import OpenFolder, gone_if_refused, locked
 from gmijax.runs.history import copy_history, draw_returns, read_metrics
 from gmijax.runs.names import attempt_folders, gmi_folders
 from gmijax.runs.resume import (
@@ -50,7 +57,15 @@ def opened(config: TrainConfig, start_point: StartPoint) -> Iterator[HeldRun]:
         changed = source.changes(config.env, saved_config(start_point.checkpoint)["env"])
         notes = notes if changed is None else (changed, *notes)
     run = start_point.open(config)
-    with locked(run.lock, f"run.dir={run.root}") as folder:
+
+    def is_needless() -> bool:
+        # The next command uses one that the user has named.
+        return given_run(config.run.dir, config.run.name) is None and not has_trained(run)
+
+    with (
+        locked(run.lock, f"run.dir={run.root}") as folder,
+        gone_if_refused(run.root, is_needless),
+    ):
         record_git(run, Path.cwd())
         yield HeldRun(run, notes, folder)
 
@@ -130,6 +145,6 @@ def what_is_left(config: TrainConfig, run: RunPaths) -> str:
     if not read_metrics(run.metrics):
         return "there is no checkpoint"
     return (
-        "there is no checkpoint: run.stop_timeout_s is the time that GMIs get to save one, after "
-        "Ctrl-C run.stall_timeout_s"
+        "no checkpoint was saved: GMIs have run.stop_timeout_s for that, after Ctrl-C "
+        "run.stall_timeout_s"
     )

@@ -38,7 +38,7 @@ from gmijax.runs.folder import (
     require_new_run,
     write_json,
 )
-from gmijax.runs.held import OpenFolder, locked
+from gmijax.runs.held import OpenFolder, gone_if_refused, locked
 from gmijax.runs.history import MetricsReader
 from gmijax.runs.resume import CheckpointMeta, find_checkpoint
 from gmijax.runs.saved_config import left_out, trained_config
@@ -104,10 +104,13 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
     job = _prepared(config, console)
     folders: list[OpenFolder] = []
     with ExitStack() as held:
-        if job.data is not None:
-            open_dataset(job.data, _about(job))
-            what = f"output.dir={job.data.root}"
-            folders.append(held.enter_context(locked(job.data.lock, what)))
+        if (data := job.data) is not None:
+            is_new = not data.dataset.exists()
+            open_dataset(data, _about(job))
+            folders.append(held.enter_context(locked(data.lock, f"output.dir={data.root}")))
+            if is_new:
+                no_shard = partial(_has_no_shard, data)
+                held.enter_context(gone_if_refused(data.root, no_shard))
         kept = job.finished_unrolls()
         if kept and kept == job.wanted_unrolls:
             raise ConfigError(
@@ -116,6 +119,7 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
             )
         env = job.config.env
         run = create_run(None, job.config.run.name, f"{env.slug}-serve")
+        held.enter_context(gone_if_refused(run.root))
         folders.append(held.enter_context(OpenFolder(run.root, f"run.dir={run.root}")))
         write_json(run.config, to_dict(job.config))
         write_json(run.plan, job.plan.to_dict())
@@ -135,6 +139,10 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
         command = f"gmijax serve {policy} output.dir=data"
         print_next(console, ("write such experience to files", command))
     return Served(run.root, summary, None if job.data is None else job.data.root)
+
+
+def _has_no_shard(data: DataPaths) -> bool:
+    return next(data.finished(), None) is None
 
 
 def _prepared(config: ServeConfig, console: Console) -> _ServingJob:
@@ -300,7 +308,7 @@ def _output(job: _ServingJob, kept: int) -> dict[str, Any] | None:
 
 def _what_is_left(job: _ServingJob) -> str:
     if job.data is None:
-        return "nothing was to be written"
+        return "no output was asked for"
     done = job.finished_unrolls()
     return (
         f"{done} of {job.wanted_unrolls} shards are in {job.data.root}; "

@@ -90,9 +90,13 @@ def _untrained(config: TrainConfig) -> RunPaths | None:
     run = RunPaths(folder.resolve())
     summary = read_json(run.summary)
     has_ended = "algo" in summary and summary.get("status") in ("failed", "interrupted")
+    return run if has_ended and not has_trained(run) else None
+
+
+def has_trained(run: RunPaths) -> bool:
+    """Whether anything was trained in a run folder."""
     # Not as the summary says, which may be of an attempt before one that was killed.
-    has_trained = checkpoints_of(run.root) or read_metrics(run.metrics)
-    return run if has_ended and not has_trained else None
+    return bool(checkpoints_of(run.root) or read_metrics(run.metrics))
 
 
 def _go_on_or_start(config: TrainConfig) -> StartPoint:

@@ -172,7 +172,7 @@ def _next_steps(config: PlayConfig, label: str) -> tuple[tuple[str, str], ...]:
 def _require_page(config: PlayConfig) -> None:
     if config.html == "on" and (absent := missing()):
         raise ConfigError(
-            f"html=on: needs {' and '.join(absent)} ({INSTALL}); allowed without are auto, off"
+            f"html=on: needs {' and '.join(absent)} ({INSTALL}); without it: auto, off"
         )
 
 
@@ -182,12 +182,12 @@ def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
     if config.randomize == "on" and not draws_models(env):
         why = "env.randomization of the run names nothing to draw"
         if env.suite == "playground":
-            why = f"Playground has no randomisation for {env.label}; allowed is off"
+            why = f"Playground has no randomisation for {env.label}; allowed: off"
         raise ConfigError(f"randomize=on: {why}")
     if config.walking_envs:
         asked = f"walking_envs={config.walking_envs}"
         if robot_of(env) is None:
-            raise ConfigError(f"{asked}: {env.label} has no walking test; allowed are 0, null")
+            raise ConfigError(f"{asked}: {env.label} has no walking test; allowed: 0, null")
         if env.action_repeat != 1:
             raise ConfigError(f"{asked}: env.action_repeat={env.action_repeat}; {ONE_ACTION}")
     return config, changed

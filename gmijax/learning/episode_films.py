@@ -29,7 +29,7 @@ class EpisodeFilms:
         if env.mj_model is None:
             raise ConfigError(
                 f"eval.video={config.eval.video}: {env.spec.name} has no model that could be "
-                "filmed; allowed is false"
+                "filmed; allowed: false"
             )
         assert config.eval.every is not None
         self._every = int(config.eval.video) * config.eval.every

@@ -124,7 +124,7 @@ def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
         if wanted == "privileged_state" and seen is None:
             raise ConfigError(
                 f"algo.{key}=privileged_state: {spec.name} has no observations for the value "
-                "function alone; allowed are auto, state"
+                "function alone; allowed: auto, state"
             )
     make_distribution, precision = DISTRIBUTIONS[config.distribution_type], config.precision
     distribution = make_distribution(spec.action_size, config.state_dependent_std)

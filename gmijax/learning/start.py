@@ -218,7 +218,7 @@ def begin_episodes(
         fits += [f"num_envs less than {most_envs}"] * (most_envs > 1)
         raise ConfigError(
             f"num_envs={num_envs}: a GMI would need more than {need} for {them} and {kept_steps} "
-            f"steps of each ({kept_key}), and has {have}; allowed are "
+            f"steps of each ({kept_key}), and has {have}; allowed: "
             f"{', or '.join(fits) or f'less of both num_envs and {kept_key}'}"
         )
     starts = env_keys(key, first_env, num_envs)

@@ -88,7 +88,7 @@ def require_room(
         most = min(most for most, _ in needs)
         raise ConfigError(
             f"{what}: {num_gmis} GMIs on this machine need about {', '.join(lacking)}; "
-            f"allowed are at most {most}"
+            f"allowed: at most {most}"
         )
 
 

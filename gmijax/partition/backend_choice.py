@@ -36,7 +36,7 @@ def choose_backend(
     if machine.gpu_problem is not None:
         raise BackendUnavailable(
             f"plan.backend=auto: the NVIDIA driver does not work: {machine.gpu_problem}; "
-            "plan.backend=cpu (or CUDA_VISIBLE_DEVICES=-1) goes on without GPUs"
+            "plan.backend=cpu (or CUDA_VISIBLE_DEVICES=-1) continues without GPUs"
         )
     if not machine.gpus:
         return "cpu", "no usable NVIDIA GPU here, so GPUs are virtual"

@@ -102,7 +102,7 @@ def why_not_under(strategy: str, layout: Layout, backend: str) -> str | None:
     if backend == "mig":
         return (
             "rings between MIG instances are not supported, because NCCL takes one of each GPU; "
-            "with plan.backend=mig allowed are auto, mpr"
+            "with plan.backend=mig only auto, mpr are allowed"
         )
     return why_no_nccl()
 

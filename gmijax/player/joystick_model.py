@@ -24,7 +24,7 @@ def joystick_model(robot: Robot, terrain: Literal["flat", "rough"]) -> Any:
         )
     xmls = package / "_src" / "locomotion" / robot.name / "xmls"
     if terrain == "rough" and f"{robot.name}_rough" not in NAMES:
-        raise ConfigError(f"terrain=rough: {robot.name} has none; allowed is flat")
+        raise ConfigError(f"terrain=rough: {robot.name} has none; allowed: flat")
     scene = xmls / f"scene_mjx_feetonly_{terrain}_terrain.xml"
     folder = model_folder(*models_of(NAMES[robot.name]))
     files = [

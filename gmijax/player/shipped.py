@@ -22,7 +22,7 @@ def require_shipped(task: str | None) -> str:
     if task is None:
         raise ConfigError(f"checkpoint=shipped: of which task? Add env=TASK; there are {tasks}")
     if task not in shipped_tasks():
-        raise ConfigError(f"env={task}: no policy of it is shipped; allowed are {tasks}")
+        raise ConfigError(f"env={task}: no policy of it is shipped; allowed: {tasks}")
     return task
 
 

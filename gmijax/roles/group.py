@@ -84,11 +84,11 @@ class GroupReducer:
     def _check(self, members: Sequence[int], op: str) -> None:
         rank, world_size = self._messenger.rank, self._messenger.world_size
         if op not in get_args(Operation):
-            raise ConfigError(f"op={op!r}: allowed are {', '.join(get_args(Operation))}")
+            raise ConfigError(f"op={op!r}: expected one of {', '.join(get_args(Operation))}")
         if rank not in members:
             raise ConfigError(f"group={members}: GMI {rank} takes part, and is not a member")
         if members[0] < 0 or members[-1] >= world_size:
-            raise ConfigError(f"group={members}: allowed are GMIs 0 to {world_size - 1}")
+            raise ConfigError(f"group={members}: there are GMIs 0 to {world_size - 1}")
 
     def _reduce_flat(
         self, group: Sequence[int], flat: npt.NDArray[Any], op: Operation

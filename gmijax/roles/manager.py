@@ -117,7 +117,7 @@ class GMIManager:
         """
         self._check(gmi)
         if not 0 <= gpu < self.num_gpus:
-            raise ConfigError(f"gpu={gpu}: allowed are GPUs 0 to {self.num_gpus - 1}")
+            raise ConfigError(f"gpu={gpu}: there are GPUs 0 to {self.num_gpus - 1}")
         self._gpu_of[gmi] = gpu
 
     def get_group(self, gmi: int, name: Hashable) -> set[int]:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from gmijax.errors import ConfigError, FolderLost
+from gmijax.errors import BackendUnavailable, ConfigError, FolderLost
 
 _GONE: Final = (errno.ENOENT, errno.ENOTDIR, errno.ESTALE)
 """Errors of a path that leads nowhere; others, of a network for one, say nothing."""
@@ -82,6 +83,20 @@ def locked(lock: Path, what: str) -> Iterator[OpenFolder]:
             yield folder
     finally:
         os.close(fd)
+
+
+@contextmanager
+def gone_if_refused(root: Path, is_empty: Callable[[], bool] = lambda: True) -> Iterator[None]:
+    """Removes a folder that a job made, if its input is refused while nothing came of it yet.
+
+    A backend that cannot be had is no such input: its logs, which the error names, stay.
+    """
+    try:
+        yield
+    except ConfigError as error:
+        if not isinstance(error, BackendUnavailable) and is_empty():
+            shutil.rmtree(root, ignore_errors=True)
+        raise
 
 
 def try_lock(lock: Path) -> int | None:

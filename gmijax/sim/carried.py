@@ -31,7 +31,7 @@ def at_start(mj_model: mujoco.MjModel, given: Mapping[str, Array]) -> dict[str, 
     for name, value in given.items():
         if name not in shapes:
             known = ", ".join(shapes)
-            raise ConfigError(f"sim.start: no {name} can be carried; allowed are {known}")
+            raise ConfigError(f"sim.start: no {name} can be carried; allowed: {known}")
         if np.shape(value) != shapes[name]:
             raise ConfigError(f"sim.start: {name} has shape {np.shape(value)}, not {shapes[name]}")
     missing = [name for name in needed(mj_model) if name not in given]

@@ -70,7 +70,7 @@ def choose_impl(
       ConfigError: an unknown implementation, or `warp` without warp-lang.
     """
     if impl not in ("auto", "jax", "warp"):
-        raise ConfigError(f"physics.impl={impl}: allowed are auto, jax, warp")
+        raise ConfigError(f"physics.impl={impl}: expected one of auto, jax, warp")
     if warp_installed is None:
         warp_installed = importlib.util.find_spec("warp") is not None
     if impl == "jax":

@@ -269,7 +269,7 @@ def _check_names(env: Env, leaf: str, names: Sequence[str]) -> None:
     if unknown := [name for name in names if name not in known]:
         raise ConfigError(
             f"env.randomization.{leaf}.names={unknown[0]}: {env.spec.name} has no such name; "
-            f"allowed are {', '.join(known)}"
+            f"allowed: {', '.join(known)}"
         )
 
 

@@ -66,7 +66,7 @@ def require_task(name: str, suite: str = "gmijax") -> None:
     if suite == "custom":
         source.split(name)
     if suite == "gmijax" and name not in TASKS:
-        raise ConfigError(f"env={name}: unknown task; allowed are {', '.join(task_names())}")
+        raise ConfigError(f"env={name}: unknown task; allowed: {', '.join(task_names())}")
 
 
 def missing_of(choice: str) -> str | None:
@@ -108,11 +108,11 @@ def _require_randomizer(env: EnvConfig) -> None:
     if env.randomize == "episode":
         raise ConfigError(
             f"env.randomize=episode: not with env={env.label}, whose episodes all begin with the "
-            "first start of their environment; allowed are off, on"
+            "first start of their environment; allowed: off, on"
         )
     if env.randomize == "on" and not draws_models(env):
         raise ConfigError(
-            f"env.randomize=on: Playground has no randomisation for {env.label}; allowed is off"
+            f"env.randomize=on: Playground has no randomisation for {env.label}; allowed: off"
         )
 
 
@@ -126,7 +126,7 @@ def _require_changes(
     """Raises ConfigError for what a task cannot have. Terms are known to its module alone."""
     if curriculum and suite != "custom" and not (suite == "gmijax" and name in CURRICULA):
         raise ConfigError(
-            f"env.curriculum=on: {name} has none; allowed are {', '.join(CURRICULA)} and "
+            f"env.curriculum=on: {name} has none; allowed: {', '.join(CURRICULA)} and "
             "env=PATH.py:FUNCTION"
         )
     if suite == "gmijax":
@@ -138,7 +138,7 @@ def _require_changes(
             if given:
                 raise ConfigError(
                     f"env.{group}.{next(iter(given))}: not with env=brax, whose environments are "
-                    "taken as they are; allowed are our tasks, env=playground and "
+                    "taken as they are; allowed: our tasks, env=playground and "
                     "env=PATH.py:FUNCTION"
                 )
 
@@ -232,7 +232,7 @@ def make_env(
 
 def _require_api(api: str, episode_length: int | None) -> None:
     if api not in ("gmijax", "brax"):
-        raise ConfigError(f"api={api}: allowed are gmijax, brax")
+        raise ConfigError(f"api={api}: expected one of gmijax, brax")
     if api == "brax":
         if episode_length is not None:
             raise ConfigError("episode_length: give it to Brax's EpisodeWrapper with api=brax")
@@ -279,7 +279,7 @@ def whole_number(key: str, value: Any) -> int:
 def _make(name: str, suite: str, changes: Mapping[str, Any], **options: Any) -> Env:
     """A task without its time limit; it gets those `changes` that are any."""
     if suite not in ("gmijax", *SUITES):
-        raise ConfigError(f"suite={suite}: allowed are gmijax, {', '.join(SUITES)}")
+        raise ConfigError(f"suite={suite}: expected one of gmijax, {', '.join(SUITES)}")
     require_task(name, suite)
     _require_changes(name, suite, **changes)
     options |= {key: value for key, value in changes.items() if value}

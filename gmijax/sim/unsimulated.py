@@ -45,7 +45,7 @@ def refuse_parts(mj_model: Model, impl: Impl) -> None:
         if impl in part.impls and part.is_in(mj_model):
             raise ConfigError(
                 f"model: {part.name}, which {FULL_NAMES[impl]} (physics.impl={impl}) does not "
-                f"simulate; allowed is {part.instead}"
+                f"simulate; allowed: {part.instead}"
             )
 
 
@@ -72,7 +72,7 @@ def refuse_idle_sensors(mj_model: Model, contacts: int, rows: int) -> None:
             kind = mujoco.mjtSensor(int(first.type[0])).name.removeprefix("mjSENS_").lower()
             raise ConfigError(
                 f"model: a sensor of forces ({first.name or kind}) in a model without {lack}, "
-                f"which MJX-JAX (physics.impl=jax) cannot fill; allowed is {instead}"
+                f"which MJX-JAX (physics.impl=jax) cannot fill; allowed: {instead}"
             )
 
 

@@ -146,7 +146,7 @@ def _require_options(
 def _require(key: str, value: Any, allowed: tuple[Any, ...]) -> None:
     if value not in allowed:
         names = ", ".join(str(one) for one in allowed if one is not None)
-        raise ConfigError(f"{key}={value}: allowed are {names}")
+        raise ConfigError(f"{key}={value}: expected one of {names}")
 
 
 def _require_packages(api: str, arrays: str) -> None:

@@ -137,7 +137,7 @@ def last_lines(path: Path, num_bytes: int = _TAIL_BYTES, begins: int = 0) -> lis
     return [printable(line) for line in text.splitlines()]
 
 
-def first_line(text: str) -> str:
-    """The first line of a text as it may be shown, shortened."""
+def first_line(text: str, most: int | None = _MAX_LINE) -> str:
+    """The first line of a text as it may be shown, shortened to `most` characters."""
     lines = text.strip().splitlines()
-    return printable(lines[0])[:_MAX_LINE] if lines else ""
+    return printable(lines[0])[:most] if lines else ""

@@ -96,8 +96,8 @@ def recorded(
         status = "interrupted"
         error.add_note(what_is_left())
         raise
-    except FolderLost:
-        raise
+    except (FolderLost, ConfigError):
+        raise  # What is wrong with the input is in the message alone.
     except GmijaxError as error:
         error.add_note(f"run folder: {run.root}")
         raise

@@ -111,7 +111,7 @@ class Supervisor:
             raise
         self._end_all()
         if self._signals.have_come:
-            raise JobInterrupted("stopped on request; all processes have finished their work")
+            raise JobInterrupted("stopped; all processes have finished their work")
 
     def _alive(self) -> list[WatchedGmi]:
         return [process for process in self._started.values() if process.exit_code is None]
@@ -143,7 +143,8 @@ class Supervisor:
             what = f"made no progress after iteration {iteration}; GMI {cause.gmi} {cause.reason}"
             raise GmiFailed(stuck.gmi, what, iteration=iteration)
         if cause.error is not None and ended_with(cause, ConfigError):
-            raise ConfigError(first_line(cause.error.message))  # Bad input stays bad input.
+            # Bad input stays bad input; the end of its line has the place.
+            raise ConfigError(first_line(cause.error.message, None))
         raise cause
 
     def _poll_failures(self) -> list[GmiFailed]:
@@ -166,7 +167,9 @@ class Supervisor:
         if not self._signals.have_come:
             return
         if self._signals.requests > 1:
-            raise JobInterrupted("stopped at once on a second request; the last work is not saved")
+            raise JobInterrupted(
+                "stopped at once by a second signal; unfinished work is not saved"
+            )
         if not all(p.is_ready for p in self._started.values()):
             raise JobInterrupted("stopped before training began")
         if not self._is_stopping:
@@ -184,7 +187,7 @@ class Supervisor:
         elif now_s > self._stop_deadline_s:
             late = [process.gmi for process in self._alive()]
             raise JobInterrupted(
-                f"stopped on request; GMIs {late} did not finish within "
+                f"stopped; GMIs {late} did not finish within "
                 f"{self._launch.timeouts.stop_timeout_s:g} s and were ended"
             )
 

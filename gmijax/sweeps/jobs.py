@@ -81,7 +81,7 @@ def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
       ConfigError: names the key.
     """
     if not jobs:
-        raise ConfigError("sweep: there is no job in it")
+        raise ConfigError("sweep: it has no jobs")
     for job in jobs:
         plan = job.config.plan
         if not isinstance(plan.gpus, int):
@@ -97,7 +97,7 @@ def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
         if job.config.run.resume not in (None, "auto"):
             raise ConfigError(
                 f"run.resume={job.config.run.resume}: the jobs of a sweep start from nothing, or "
-                "go on where the same sweep was interrupted"
+                "continue where the same sweep was interrupted"
             )
 
 

@@ -110,7 +110,7 @@ def require_packable(settings: SweepConfig, jobs: Sequence[Job]) -> None:
         if (why := why_alone(job)) is not None:
             raise ConfigError(
                 f"sweep.pack=vmap: job {job.number} has {why}, which needs processes of its own; "
-                "allowed are auto, gmi"
+                "allowed: auto, gmi"
             )
 
 

@@ -71,7 +71,7 @@ def profile_jobs(
             return NotRunnable(" ".join(str(error).split()))
         if (rate := window.steps_per_s) is None:
             failed = next((j.progress.error for j in jobs if j.progress.error), None)
-            return NotRunnable(failed or f"no end within {limit_s:.0f} s", limit_s)
+            return NotRunnable(failed or f"did not end within {limit_s:.0f} s", limit_s)
         return Measured(rate / count, _memory_mib(paths, jobs), window.iteration_s)
 
 

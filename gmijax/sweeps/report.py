@@ -177,7 +177,7 @@ def _setting_table(settings: Sequence[Row], ranking: Ranking) -> Table:
             rows.append(("-", label, "-", "-", n))
             continue
         low, high = setting["quartiles"]
-        note = "" if setting["window_full"] else " (windows not full)"
+        note = "" if setting["window_full"] else " (too few episodes to compare)"
         middle = f"{setting['interquartile_mean']:.4g}{note}"
         rows.append((str(rank), label, middle, f"{low:.4g} to {high:.4g}", n))
     return _table(("rank", "setting", mean, "quartiles", "n"), rows)
@@ -217,8 +217,8 @@ def shown(value: float | None, is_full: bool, episodes: int | None) -> str:
         return "-"
     if is_full:
         return f"{value:.4g}"
-    over = "" if episodes is None else f"{episodes:,} episodes, "
-    return f"{value:.4g} ({over}window not full)"
+    few = "too few episodes" if episodes is None else f"{episodes:,} episodes, too few"
+    return f"{value:.4g} ({few} to compare)"
 
 
 def draw_curves(jobs: Sequence[AnyJob], ranking: Ranking, paths: SweepPaths) -> None:

@@ -104,7 +104,7 @@ class SweepWork(Work[Job]):
     @property
     def unranked(self) -> str:
         """See `Work`."""
-        return f"no job that is complete has had sweep.objective={self.ranking.objective}"
+        return f"no completed job has a value of sweep.objective={self.ranking.objective}"
 
     def state_of(self, run: RunPaths, job: Job) -> State:
         """See `Work`."""

@@ -273,7 +273,7 @@ def test_models_and_randomisers_are_known_for_every_task() -> None:
             {"settings": {"noise_config.levl": 1.0}},
             "^env.settings.noise_config.levl: no such number: did you mean noise_config.level",
         ),
-        ({"settings": {"x": 1.0}}, "^env.settings.x: no such number: allowed are Kd, Kp, action_"),
+        ({"settings": {"x": 1.0}}, "^env.settings.x: no such number; allowed: Kd, Kp, action_"),
         ({"settings": {"pert_config.enable": 2.0}}, "pert_config.enable=2.0: must be 0 or 1$"),
         ({"settings": {"history_len": 1.5}}, "history_len=1.5: must be a whole number$"),
         ({"rewards": {"torqes": 1.0}}, "^env.rewards.torqes: .* no such term: did you mean torq"),

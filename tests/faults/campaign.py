@@ -32,7 +32,7 @@ def main() -> int:
     end_s = time.monotonic() + 60 * given.minutes
     kinds = [kind for kind in given.kinds.split(",") if kind] or kinds_here()
     if unknown := set(kinds) - set(ALL_KINDS):
-        sys.exit(f"--kinds={','.join(sorted(unknown))}: allowed are {', '.join(ALL_KINDS)}")
+        sys.exit(f"--kinds={','.join(sorted(unknown))}: expected one of {', '.join(ALL_KINDS)}")
     trials = list(draw_trials(given.seed, given.faults, kinds))
     settings = {"seed": given.seed, "faults": given.faults, "kinds": given.kinds}
     file = ResultsFile(given.out, "faults", settings, resume=given.resume, device="cpu")

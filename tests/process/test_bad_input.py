@@ -18,7 +18,7 @@ from training_jobs import train
         ("play", [], "run.dir=last: no run with a checkpoint"),
         ("export", [], "run.dir=last: no run with a checkpoint"),
         ("pack", ["seed=0,1", "--", "true", "{sed}"], "seed=: the command has no {seed}"),
-        ("doctor", ["gpu=x"], "gpu=x: allowed are --json"),
+        ("doctor", ["gpu=x"], "gpu=x: expected one of --json"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_two(

@@ -86,6 +86,17 @@ def test_after_a_mistake_in_the_file_the_same_command_trains(tmp_path: Path):
     assert "exists already" in train(*command, cwd=tmp_path).stderr
 
 
+@pytest.mark.parametrize("command", ["train", "serve"])
+def test_nothing_is_left_of_a_command_whose_task_fails(command: str, tmp_path: Path):
+    (tmp_path / "point.py").write_text(f"raise ImportError('{'x' * 400}')")
+    own = ("policy=random", "output.dir=data", "run.name=mine") if command == "serve" else ()
+    done = train("env=point.py:make", *own, cwd=tmp_path, command=command)
+    assert done.returncode == 2
+    assert done.stderr.endswith("point.py:1)\n")  # However long the error is.
+    assert not list((tmp_path / "runs").iterdir())
+    assert not (tmp_path / "data").exists()
+
+
 def test_files_may_have_the_names_of_packages(tmp_path: Path):
     """Beside the task and in the working directory; the neighbour is the one of the task."""
     for name in ("random", "queue", "statistics", "optax", "flax/__init__", "gmijax/__init__"):

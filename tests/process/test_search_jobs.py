@@ -80,7 +80,7 @@ def test_what_takes_too_long_is_ended_and_not_runnable(tmp_path: Path):
     done = train(*JOB, *limits, "run.dir=s", cwd=tmp_path, command="search")
     assert done.returncode == 1, done.stderr
     assert "no point of the search can run" in done.stderr
-    assert "no end within 5 s (GMI 0 " in done.stderr
+    assert "did not end within 5 s (GMI 0 " in done.stderr
     assert pids_of(tmp_path / "s" / "profiles" / "2x32-jax") == []
 
 

@@ -300,7 +300,7 @@ def test_a_second_request_ends_at_once(
             signals.handle(number)
             now_s[0] += 2.0
 
-    with pytest.raises(JobInterrupted, match="second request"):
+    with pytest.raises(JobInterrupted, match="second signal"):
         run_job(cpu_supervisor(run, ["deaf", "deaf"], signals=signals, waits=True), stop_again)
 
 

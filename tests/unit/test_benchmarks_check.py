@@ -118,7 +118,7 @@ def test_a_wrong_digit_in_a_table_is_found(tmp_path: Path):
     [
         ("figure: none.json#a/b .2f -->0.72<!-- /figure", "no such file of results"),
         (f"figure: {REFERENCE} over none/a .2f -->0.72<!-- /figure", "runs.json has no"),
-        ("table: none -->\n<!-- /table", "table none: allowed are advice, "),
+        ("table: none -->\n<!-- /table", "table none: expected one of advice, "),
     ],
 )
 def test_a_figure_without_a_file_and_an_unknown_table_are_found(

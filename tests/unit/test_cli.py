@@ -14,11 +14,12 @@ from command_lines import run
 import gmijax
 from gmijax.cli.command import command
 from gmijax.cli.compose import compose, defaults
-from gmijax.cli.grid import SweepHelp
+from gmijax.cli.grid import SweepHelp, build_sweep
 from gmijax.cli.groups import choices
 from gmijax.cli.help import USUAL, keys_of, print_help, topics_of
 from gmijax.cli.pack import PackKeys
 from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
+from gmijax.control.console import Show, open_console
 from gmijax.errors import ConfigError
 
 LONG = "a" * 300
@@ -35,7 +36,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "env=antt", "env=antt: unknown task: did you mean ant?"),
     ("train", "env=brax:ant", "unknown task: did you mean env=brax env.name=ant?"),
     ("sweep", "env=playground:Go1Getup", "did you mean env=playground env.name=Go1Getup?"),
-    ("train", "algo=td3", "algo=td3: unknown algorithm: allowed are a3c, distill, ppo, sac"),
+    ("train", "algo=td3", "algo=td3: unknown algorithm: expected one of a3c, distill, ppo, sac"),
     ("train", "num_env=3", "unknown key num_env: did you mean num_envs?"),
     ("train", "algo.gamma=0.9", "unknown key algo.gamma: did you mean algo.discounting?"),
     ("train", "algo.rate=1", "unknown key algo.rate: did you mean algo.learning_rate?"),
@@ -44,11 +45,18 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "algo.num_layers=2", "_layers: did you mean algo.policy_hidden_layer_sizes?"),
     ("train", "algo.zzz=2", "unknown key algo.zzz: see --help all"),
     ("train", "ent=ant", "unknown key ent: did you mean env?"),
-    ("train", "--num-envs=64", "unknown option --num-envs=64: allowed are --help, --verbose, "),
+    ("train", "--num-envs=64", "unknown option --num-envs=64; allowed: --help, --verbose, "),
     ("train", "--num-envs=64", "; did you mean num_envs=64?"),
     ("train", "--num_envs 64", "; did you mean num_envs=64?"),
-    ("sweep", "--seed 1 --quiet", "unknown option --seed: allowed are --help, --verbose, "),
+    ("sweep", "--seed 1 --quiet", "unknown option --seed; allowed: --help, --verbose, "),
     ("train", "seed=0,1", "(a list stands in brackets); gmijax sweep takes several"),
+    ("train", "seed = 3", "seed = 3: write it without blanks: seed=3"),
+    ("sweep", "env=ant seed= 3", "seed= 3: write it without blanks: seed=3"),
+    ("play", "env =ant", "env =ant: write it without blanks: env=ant"),
+    ("train", "=3 seed=4", "=3: expected key=value"),
+    ("sweep", "seed=0:3", "for several: gmijax sweep seed=0,1,2 or 'seed=range(0,3)'"),
+    ("train", "num_envs=8-99", "sweep num_envs=8,9,10,... or 'num_envs=range(8,100)'"),
+    ("sweep", "sweep.trials=1:3", "sweep.trials=1:3: expected an integer or null\n"),
     ("train", "lr=1", "unknown key lr: did you mean algo.learning_rate?"),
     ("train", "total_timesteps=1", "unknown key total_timesteps: did you mean num_timesteps?"),
     (
@@ -56,7 +64,7 @@ REFUSED: list[tuple[str, str, str]] = [
         "plan.unroll_lenght=8",
         "unknown key plan.unroll_lenght: did you mean algo.unroll_length?",
     ),
-    ("play", "lr=1", "unknown key lr: allowed are"),
+    ("play", "lr=1", "unknown key lr; allowed:"),
     ("train", "sh", "sh: expected key=value\n"),
     ("pack", "seed=0,1 sh", "sh: expected key=value; a command to run comes after --"),
     ("train", "+foo.bar=1", "unknown key foo"),
@@ -65,7 +73,7 @@ REFUSED: list[tuple[str, str, str]] = [
     (
         "train",
         "--quiet",
-        "unknown option --quiet: allowed are --help, --verbose, --cfg job, key=value",
+        "unknown option --quiet; allowed: --help, --verbose, --cfg job, key=value",
     ),
     ("train", "ant", "ant: expected key=value; did you mean env=ant?"),
     ("train", "humanod", "humanod: expected key=value; did you mean env=humanoid?"),
@@ -98,7 +106,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("play", "env=antt checkpoint=shipped", "env=antt: no policy of it is shipped"),
     ("export", "env=ant", "unknown key env: did you mean run.env?"),
     ("export", "run.env=ant", "env=ant: a run knows its task\n"),
-    ("export", "run.dir=x tuned=ant_ppo", "unknown key tuned: allowed are checkpoint"),
+    ("export", "run.dir=x tuned=ant_ppo", "unknown key tuned; allowed: checkpoint"),
     # Values of a wrong type, or out of range.
     ("train", "num_envs=many", "num_envs=many: expected an integer"),
     ("train", "num_timesteps=30M", "num_timesteps=30M: expected an integer; did you mean 30e6?"),
@@ -161,23 +169,23 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "reduce.strategy=flat plan.gmis_per_gpu=2", "NCCL before 2.30"),
     # What is changed about a task.
     ("train", "env=ant env.rewards.enrgy=1", "env.rewards.enrgy: did you mean energy?"),
-    ("train", "env=anymal env.rewards.x=1", "env.rewards.x: allowed are torque, velocity, y"),
+    ("train", "env=anymal env.rewards.x=1", "env.rewards.x; allowed: torque, velocity, y"),
     ("train", "env=brax env.name=ant env.rewards.x=1", "x: this task has none in env.rewards"),
     ("train", "env=ant env.rewards.energy=low", "env.rewards.energy=low: expected a finite num"),
-    ("train", "env=ant env.settings.goal_m=1", "unknown key env.settings.goal_m: allowed are"),
-    ("train", "env=ant +env.settings.goal_m=1", "unknown key env.settings.goal_m: allowed are"),
+    ("train", "env=ant env.settings.goal_m=1", "unknown key env.settings.goal_m; allowed:"),
+    ("train", "env=ant +env.settings.goal_m=1", "unknown key env.settings.goal_m; allowed:"),
     ("serve", "env=anymal env.settings.action_scale_rad=0 policy=random", "=0.0: must be greater"),
     ("train", "env=anymal env.settings.start_factor_min=2", "min=2.0: must be at most env.set"),
-    ("train", "env=ant env.curriculum=on", "env.curriculum=on: ant has none; allowed are anymal"),
+    ("train", "env=ant env.curriculum=on", "env.curriculum=on: ant has none; allowed: anymal"),
     ("train", "env.history=0", "env.history=0: must be at least 1"),
     ("train", "env.action_repeat=0", "env.action_repeat=0: must be at least 1"),
-    ("serve", "policy=random plan.template=tcg_ex", "not for gmijax.serve; allowed are auto, tcg"),
+    ("serve", "policy=random plan.template=tcg_ex", "not for gmijax.serve; allowed: auto, tcg"),
     ("serve", "policy=random plan.template=tgc", "plan.template=tgc: expected one of auto, tcg"),
     # Folders and policies.
     ("train", "run.dir=.", "the run folder exists already"),
     ("train", "run.resume=nowhere", "run.resume=nowhere: no such folder"),
     ("train", "run.resume=last", "no run with a checkpoint"),
-    ("train", "run.resume=auto", "run.resume=auto: needs run.dir or run.name, the folder to go"),
+    ("train", "run.resume=auto", "run.resume=auto: needs run.dir or run.name, the folder to co"),
     ("serve", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
     ("serve", "", "run.dir=last: no run with a checkpoint in runs/"),
     ("serve", "run.dir=null", "policy=trained: needs run.dir=RUN"),
@@ -190,13 +198,13 @@ REFUSED: list[tuple[str, str, str]] = [
     ("search", "search.gmis_per_gpu=[2,2]", "search.gmis_per_gpu=[2, 2]: expected distinct"),
     ("search", "search.num_envs=[]", "search.num_envs=[]: expected distinct numbers"),
     ("search", "search.num_envs=[0]", "search.num_envs=0: must be at least 1"),
-    ("search", "search.impls=[cuda]", "search.impls=cuda: allowed are jax, warp"),
+    ("search", "search.impls=[cuda]", "search.impls=cuda: expected one of jax, warp"),
     ("search", "search.budget_s=2", "search.budget_s=2: too small for one profile"),
     ("search", "plan.backend=mps", "plan.backend=mps"),
     (
         "search",
         "plan.template=tdg_ex",
-        "not for a search (numbers that are auto); allowed are auto, tcg_ex",
+        "not for a search (numbers that are auto); allowed: auto, tcg_ex",
     ),
     ("search", "plan.layout=[]", "plan.layout=[]: every GPU needs at least one GMI"),
     ("search", f"{A3C} plan.serving_gpus=[0,1] plan.training_gpus=[1]", APART),
@@ -205,7 +213,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("search", f"{A3C} plan.serving_gpus=1", "plan.training_gpus=null: there must be serving"),
     ("search", f"{A3C} plan.layout=[[0],[1]]", "plan.layout=[[0], [1]]: with the decoupled"),
     # What is hardly a command line.
-    ("train", "-env=\n", "unknown option -env=\\n: allowed"),
+    ("train", "-env=\n", "unknown option -env=\\n; allowed"),
     ("train", "\r", r"'\r': expected text without control characters"),
     ("train", "run.name=lr=3e-4", "run.name=lr=3e-4: not a value; text with such characters"),
     ("train", "run.dir=runs/(v2)", """needs quotes: "run.dir='runs/(v2)'\""""),
@@ -266,6 +274,13 @@ def test_text_in_quotes_is_taken_as_the_message_says(value: str):
     assert compose(quoted).run.name == value
 
 
+def test_a_value_may_be_empty_or_begin_with_a_blank():
+    assert compose("run.name=", "env=ant").env.name == "ant"
+    assert compose("run.name= a").run.name == "a"
+    with pytest.raises(ConfigError, match=r"without blanks: seed=3$"):
+        compose("seed = 3")
+
+
 @pytest.mark.parametrize("value", ["a\nb", os.fsdecode(b"a\xffb")])
 def test_what_the_environment_has_is_text_too(value: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("A_NAME", value)
@@ -276,6 +291,34 @@ def test_what_the_environment_has_is_text_too(value: str, monkeypatch: pytest.Mo
 def test_a_task_may_be_named_twice_and_a_plan_may_have_1024_gmis():
     assert compose("env=ant", "env.name=ant") == compose("env=ant")
     assert compose("plan.gpus=1024").plan.gpus == 1024
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "is_named"),
+    [
+        ("train", "num_envs=8", True),
+        ("train", "run.resume=auto run.dir=x", True),
+        ("train", "env=ball_balance", False),
+        ("sweep", "seed=0,1", True),
+        ("sweep", "env=ball_balance,ant", False),
+        ("serve", "policy=random", True),
+        ("serve", "policy=random env=ant", False),
+    ],
+)
+def test_a_task_that_nobody_chose_is_named_first(
+    name: str, line: str, is_named: bool, capsys: pytest.CaptureFixture[str]
+):
+    def say(_: object, *, show: Show) -> None:
+        console = open_console(show=show)
+        console.print("run folder: x")
+        console.print("more")
+
+    make = build_sweep if name == "sweep" else None
+    assert command(name, COMMANDS[name], say, line.split(), make=make) == 0
+    *first, folder, more = capsys.readouterr().out.splitlines()
+    assert [folder, more] == ["run folder: x", "more"]
+    named = "task: ball_balance, the default; choose another with env=NAME (gmijax list-envs shows"
+    assert first == ([f"{named} them)"] if is_named else [])
 
 
 def test_help_lists_every_key(capsys: pytest.CaptureFixture[str]):

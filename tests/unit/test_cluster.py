@@ -226,7 +226,7 @@ def test_fewer_nodes_than_asked_for_are_refused_once_the_wait_is_over(
         cluster.join(2, None, least_gpus=2, most_gpus=2)
     assert cluster.has_gpus
     patient = RayCluster(ClusterConfig(wait_s=100.0), Node)
-    with pytest.raises(JobInterrupted, match="while it waited for nodes"):
+    with pytest.raises(JobInterrupted, match="stopped while waiting for nodes"):
         patient.join(2, 2, is_unwanted=lambda: True)
 
 

@@ -216,7 +216,7 @@ def test_exit_code_says_whether_something_is_broken(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--jsn"], "--jsn: allowed are --json, --verbose, mig=SIZES"),
+        (["--jsn"], "--jsn: expected one of --json, --verbose, mig=SIZES"),
         (["gpu=1"], "gpu=1: only together with mig="),
         (["mig=3g", "--json"], "--json: not together with mig="),
         (["mig=3g", "cluster=auto"], "cluster=auto: not together with mig="),

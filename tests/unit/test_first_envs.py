@@ -39,7 +39,7 @@ def test_more_environments_than_memory_holds_are_refused_before_there_is_one(
 
 def test_what_fits_is_told_and_is_taken(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(start, "detect_host", lambda: HostLimits(memory_mib=1))
-    with pytest.raises(ConfigError, match=r"allowed are .*num_envs less than") as refused:
+    with pytest.raises(ConfigError, match=r"allowed: .*num_envs less than") as refused:
         begin(10**6)
     most = int(str(refused.value).rpartition(" ")[2])
     begin(most - 1)
@@ -49,9 +49,9 @@ def test_what_fits_is_told_and_is_taken(monkeypatch: pytest.MonkeyPatch):
         begin(most - 1, kept_steps=8)
     with pytest.raises(ConfigError, match="for those of 2 runs and 4 steps of each"):
         start.begin_episodes(ENV, KEY, 7, most - 1, kept_steps=4, num_runs=2)
-    with pytest.raises(ConfigError, match=r"allowed are unroll_length up to \d+$"):
+    with pytest.raises(ConfigError, match=r"allowed: unroll_length up to \d+$"):
         begin(8, kept_steps=10**9)  # Not even one environment could have so many.
-    with pytest.raises(ConfigError, match="allowed are less of both num_envs and unroll_length"):
+    with pytest.raises(ConfigError, match="allowed: less of both num_envs and unroll_length"):
         begin(10**6, kept_steps=10**9)
     monkeypatch.setattr(start, "detect_host", HostLimits)  # Unknown.
     begin(most + 1)

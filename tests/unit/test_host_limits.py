@@ -28,7 +28,7 @@ def test_a_thousand_gmis_on_two_cores_are_refused():
         planned(two_cores(), gmis_per_gpu=1000)
     assert str(error.value) == (
         "plan.gmis_per_gpu=1000: 1000 GMIs on this machine need about 586 GiB of memory (there "
-        "are 24 GiB), 63 CPU cores, one for every 16 (there are 2); allowed are at most 32"
+        "are 24 GiB), 63 CPU cores, one for every 16 (there are 2); allowed: at most 32"
     )
 
 
@@ -41,14 +41,14 @@ def test_a_thousand_gmis_on_two_cores_are_refused():
     ],
 )
 def test_every_way_to_ask_for_too_many_is_refused(changes: dict[str, Any], what: str):
-    with pytest.raises(ConfigError, match=f"^{what}.*; allowed are at most 32$"):
+    with pytest.raises(ConfigError, match=f"^{what}.*; allowed: at most 32$"):
         planned(two_cores(), **changes)
 
 
 @pytest.mark.parametrize("side", ["serving", "training"])
 def test_too_many_agents_or_trainers_are_refused(side: str):
     config = gmijax.compose("env=ant", "algo=a3c", f"plan.{side}_gmis_per_gpu=1000")
-    with pytest.raises(ConfigError, match=r"plan\.serving_gmis_per_gpu=.*allowed are at most 32$"):
+    with pytest.raises(ConfigError, match=r"plan\.serving_gmis_per_gpu=.*allowed: at most 32$"):
         training_plan(config, two_cores())
 
 
@@ -64,8 +64,7 @@ def test_each_limit_is_told(host: HostLimits, needs: str, most: int):
     with pytest.raises(ConfigError) as error:
         planned(two_cores(host), gmis_per_gpu=8)
     assert str(error.value) == (
-        f"plan.gmis_per_gpu=8: 8 GMIs on this machine need about {needs}; allowed are at most "
-        f"{most}"
+        f"plan.gmis_per_gpu=8: 8 GMIs on this machine need about {needs}; allowed: at most {most}"
     )
 
 
@@ -78,9 +77,9 @@ def test_what_there_is_room_for_is_planned_and_one_may_always_try():
 def test_beside_gpus_memory_counts_and_cores_do_not():
     here = machine(1, cpu_cores=(0,), mps_control=MPS, host=SMALL)
     assert planned(here, gmis_per_gpu=20).layout.num_gmis == 20
-    with pytest.raises(ConfigError, match=r"39\.1 GiB of memory .*; allowed are at most 24$"):
+    with pytest.raises(ConfigError, match=r"39\.1 GiB of memory .*; allowed: at most 24$"):
         planned(here, gmis_per_gpu=40)
-    with pytest.raises(ConfigError, match=r"2 CPU cores.*; allowed are at most 16$"):
+    with pytest.raises(ConfigError, match=r"2 CPU cores.*; allowed: at most 16$"):
         planned(here, gmis_per_gpu=20, backend="cpu")
 
 

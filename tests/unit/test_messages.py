@@ -92,9 +92,9 @@ def test_messages_to_oneself(alone: Messenger) -> None:
 
 @pytest.mark.parametrize("rank", [-1, 2, 0.5, "1"])
 def test_ranks_that_there_are_not(alone: Messenger, rank: int) -> None:
-    with pytest.raises(ConfigError, match=r"dst=.*: allowed are GMIs 0 to 1"):
+    with pytest.raises(ConfigError, match=r"dst=.*: there are GMIs 0 to 1"):
         alone.send("hello", rank)
-    with pytest.raises(ConfigError, match=r"src=.*: allowed are GMIs 0 to 1"):
+    with pytest.raises(ConfigError, match=r"src=.*: there are GMIs 0 to 1"):
         alone.recv(rank)
 
 

@@ -72,7 +72,7 @@ def test_a_module_that_is_not_found_says_where_it_may_be(folder: Path):
         custom.make(f"{task}:make")
     assert str(error.value) == (
         f"env={task} fails: ModuleNotFoundError: No module named 'rewards_of_mine' ({task}:1); "
-        "found are files beside the task, installed packages, and folders of PYTHONPATH"
+        "imports are found beside the task, among installed packages and in PYTHONPATH"
     )
 
 

@@ -81,7 +81,7 @@ def test_a_display_that_fails_is_given_up(capsys: pytest.CaptureFixture[str]):
     progress = ConsoleProgress(open_console(show=True), broken, 100)
     for _ in range(2):
         progress.update((GmiStatus(0, "running", 1, 1, None),))
-    assert capsys.readouterr().out == "no progress from here on: RuntimeError('off')\n"
+    assert capsys.readouterr().out == "progress is no longer shown: RuntimeError('off')\n"
 
 
 SYNC = {"env_steps": 500, "env_steps_per_s": 1234.5, "return": 7.25}

@@ -37,7 +37,7 @@ def test_placeholders_are_named_once_in_order():
     [
         (["{sed}"], ["seed"], r"seed=: the command has no \{seed\}"),
         (["{seed}", "{sead}"], ["seed"], r"\{sead\}: no such placeholder: did you mean seed\?"),
-        (["{nothing}"], [], r"\{nothing\}: no such placeholder: allowed are job, run_dir"),
+        (["{nothing}"], [], r"\{nothing\}: no such placeholder; allowed: job, run_dir"),
         (["{job}"], ["job"], r"job=: every job has \{job\} of its own"),
     ],
 )

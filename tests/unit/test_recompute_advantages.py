@@ -127,5 +127,5 @@ def test_two_trainers_learn_what_one_does(state, rolled) -> None:
 
 
 def test_trainers_apart_from_their_simulators_cannot() -> None:
-    with pytest.raises(ConfigError, match=r"recompute_advantages=true: .* allowed is false"):
+    with pytest.raises(ConfigError, match=r"recompute_advantages=true: .* must be false"):
         compose("algo.recompute_advantages=true", "plan.template=tdg_ex")

@@ -270,7 +270,10 @@ def test_a_lost_gpu_shrinks_the_plan(
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("plan.gpus=2",), r"GPUs \[1\] .* gone; run\.elastic=true would go on with the 1 left"),
+        (
+            ("plan.gpus=2",),
+            r"GPUs \[1\] .* gone; run\.elastic=true would continue with the 1 left",
+        ),
         (("run.elastic=true", "plan.gpus=[1]"), r"GPUs \[0\] .* gone, and no other one is left"),
     ],
 )

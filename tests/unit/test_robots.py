@@ -95,14 +95,14 @@ def test_names_of_playground_stay() -> None:
         (
             "env.randomize=episode",
             "env.randomize=episode: not with env=g1, whose episodes all begin with the first "
-            "start of their environment; allowed are off, on",
+            "start of their environment; allowed: off, on",
         ),
         (
             "+env.randomization.body_mass={operation: scale, range: [1,2]}",
             "env.randomization.body_mass: not with env=g1; tasks of Playground bring what they "
             "draw, or draw nothing",
         ),
-        ("env.curriculum=on", "env.curriculum=on: g1 has none; allowed are anymal"),
+        ("env.curriculum=on", "env.curriculum=on: g1 has none; allowed: anymal"),
         ("env.name=go1", "env.name=go1: choose the task with env=go1"),
         ("seed=0", "env=g1: MENAGERIE_ROOT=/nowhere has no model unitree_g1 (docs/tasks.md)"),
     ],
@@ -125,7 +125,7 @@ def test_commands_of_go1_have_no_negative_amplitude() -> None:
 def test_a_task_without_a_randomiser_is_not_randomised(name: str) -> None:
     label = name.replace(" env.name=", "/")
     assert refused(*f"env={name} env.randomize=on".split()) == (
-        f"env.randomize=on: Playground has no randomisation for {label}; allowed is off"
+        f"env.randomize=on: Playground has no randomisation for {label}; allowed: off"
     )
     assert draws_models(gmijax.compose("env=t1_rough").env)
 

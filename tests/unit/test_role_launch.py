@@ -80,7 +80,7 @@ def test_the_manager_says_what_is_missing() -> None:
         manager.add_gmi(0)
     with pytest.raises(ConfigError, match=r"gmi=3: not registered; registered are \[0\]"):
         manager.set_gpu(3, 0)
-    with pytest.raises(ConfigError, match="gpu=2: allowed are GPUs 0 to 1"):
+    with pytest.raises(ConfigError, match="gpu=2: there are GPUs 0 to 1"):
         manager.set_gpu(0, 2)
     with pytest.raises(ConfigError, match="gmi=0: bound to no GPU"):
         manager.plan()

@@ -117,7 +117,7 @@ def test_an_interrupted_search_goes_on_where_it_was(profiles: Use):
     first = profiles(interrupted)
     with pytest.raises(JobInterrupted) as stopped:
         found()
-    assert "goes on from" in stopped.value.__notes__[0]
+    assert "continues from" in stopped.value.__notes__[0]
     rest = profiles(scaling)
     result, _ = found()
     assert rest.asked[0] == first.asked[-1]
@@ -153,21 +153,23 @@ def test_points_for_which_the_host_is_too_small_are_told_and_not_started(
     again = profiles(scaling)
     assert found()[0].gmis_per_gpu == 4
     assert {point.gmis_per_gpu for point in again.asked} == {4}
-    with pytest.raises(ConfigError, match=r"^plan\.gmis_per_gpu=64: 64 GMIs .* are at most 2$"):
+    with pytest.raises(
+        ConfigError, match=r"^plan\.gmis_per_gpu=64: 64 GMIs .*; allowed: at most 2$"
+    ):
         found("plan.gmis_per_gpu=64", here=few)
 
 
 def test_a_profile_that_hangs_cannot_run(profiles: Use):
     def late(point: Point) -> Measured:
         if point.num_envs == 128:
-            raise ProfileLate("no end within 5 s (GMI 0 compiling)")
+            raise ProfileLate("did not end within 5 s (GMI 0 compiling)")
         return scaling(point)
 
     profiles(late)
     result, _ = found("search.budget_s=20")
     assert result.num_envs == 64
     reasons = [point.get("reason") for point in result.report["points"]]
-    assert reasons.count("no end within 5 s (GMI 0 compiling)") == 2
+    assert reasons.count("did not end within 5 s (GMI 0 compiling)") == 2
     again = profiles(scaling)
     assert found("search.budget_s=20")[0].num_envs == 64
     assert again.asked == []
@@ -180,7 +182,7 @@ def test_more_time_is_advised_where_nothing_ended_in_time_and_only_there(profile
         raise ProfileLate(f"{point} is slow")
 
     profiles(late)
-    advice = "; give more search.budget_s, or smaller sizes in search.num_envs"
+    advice = "; raise search.budget_s, or use smaller sizes in search.num_envs"
     with pytest.raises(GmijaxError, match=rf"no point of the search can run; .* is slow{advice}$"):
         found()
     profiles(lambda point: NotRunnable(f"{point} has no room"))

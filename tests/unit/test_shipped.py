@@ -50,7 +50,7 @@ def policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (["env=ant"], "env=ant: no policy of it is shipped; allowed are ball_balance"),
+        (["env=ant"], "env=ant: no policy of it is shipped; allowed: ball_balance"),
         ([], "checkpoint=shipped: of which task? Add env=TASK; there are ball_balance"),
         (["env=ball_balance", "deterministic=false"], "deterministic=False: allowed with"),
         (["env=ball_balance", "randomize=on"], "randomize=on: allowed with checkpoint=shipped is"),

@@ -125,9 +125,7 @@ def test_a_model_without_memory_carries_nothing_more():
 
 def test_a_start_knows_names_and_shapes_of_what_is_carried():
     sim, at = sim_with('<motor joint="a"/>'), (jnp.zeros(1), jnp.zeros(1))
-    with pytest.raises(
-        ConfigError, match=r"no mocap can be carried; allowed are act, time, history"
-    ):
+    with pytest.raises(ConfigError, match=r"no mocap can be carried; allowed: act, time, history"):
         sim.start(*at, mocap=jnp.zeros(3))
     with pytest.raises(ConfigError, match=r"mocap_pos has shape \(3,\), not \(1, 3\)"):
         sim.start(*at, mocap_pos=jnp.zeros(3))

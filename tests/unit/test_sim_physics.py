@@ -64,7 +64,7 @@ def test_choice_of_implementation(
     ("impl", "message"),
     [
         ("warp", r"physics\.impl=warp: needs the package warp-lang"),
-        ("cuda", r"physics\.impl=cuda: allowed are auto, jax, warp"),
+        ("cuda", r"physics\.impl=cuda: expected one of auto, jax, warp"),
     ],
 )
 def test_an_implementation_that_cannot_be_had(impl: str, message: str):

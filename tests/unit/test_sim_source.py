@@ -104,11 +104,13 @@ def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pyte
     ("old", "new", "message"),
     [
         ("def make(", "def mak(", r"no function make there: did you mean mak\?$"),
+        # Not what it imports.
+        ("def make(", "from os.path import join\ndef start(", r"there; allowed: start$"),
         ("def make(", "def make(:", r"point\.py fails: SyntaxError: .*line 8\)$"),
         (
             "import jax.",
             "import jaxx.",
-            r"ModuleNotFoundError: .*'jaxx'.*point\.py:2\); found are files beside",
+            r"ModuleNotFoundError: .*'jaxx'.*point\.py:2\); imports are found beside",
         ),
         ("impl, max_envs", "impl", r"TypeError: .*unexpected keyword argument 'max_envs'$"),
         ("return Env(SPEC", "return Env(None", r"spec: expected an EnvSpec, got NoneType"),

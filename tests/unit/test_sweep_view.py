@@ -139,7 +139,7 @@ def test_a_value_of_a_window_that_is_not_full_is_marked_where_it_is_shown() -> N
         view.update()
     # Nothing is overridden: there is nothing to say of it.
     assert said.getvalue().startswith("job 0: completed after ")
-    assert "s, return 8 (12 episodes, window not full); " in said.getvalue()
+    assert "s, return 8 (12 episodes, too few to compare); " in said.getvalue()
 
 
 @pytest.mark.parametrize("what", ["a terminal that is closed", "a row that cannot be made"])
@@ -161,7 +161,7 @@ def test_an_error_of_the_view_ends_the_view_alone(
         view.update()
     assert terminal.getvalue() == before
     if what == "a row that cannot be made":
-        assert before.count("no progress from here on: ValueError") == 1
+        assert before.count("progress is no longer shown: ValueError") == 1
 
 
 def test_overrides_and_value_of_a_job_are_there_for_the_hparams_tab(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
     ("overrides", "said"),
     [
         (("seed=range(3,3)",), "an empty list"),
-        (("seed=1,1",), "a value that comes twice"),
+        (("seed=1,1",), "a value is repeated"),
         (("algo.learning_rate=interval(0,1)",), "an interval has no list of values"),
         (("seed=range(200)", "num_envs=range(1,200)"), "39,800 jobs; at most 10,000"),
         (("sweep.jobs_per_gpu=1,2",), "expected one value"),
@@ -170,10 +170,10 @@ EVALUATED = LINE | {"eval/return": 1.0, "eval/length": 20.0}
     ("line", "objective", "said"),
     [
         (LINE, "metric/distnace", r": did you mean metric/distance\?"),
-        (LINE, "metric/speed", r": allowed are metric/distance"),
-        (LINE, "loss/entropy_of_policy", r": allowed are loss/kl"),
+        (LINE, "metric/speed", r"; allowed: metric/distance"),
+        (LINE, "loss/entropy_of_policy", r"; allowed: loss/kl"),
         (LINE, "retrun", r": did you mean return\?"),
-        (LINE, "speed/x", r": allowed are env_steps, loss/kl, metric/distance, return, reward/"),
+        (LINE, "speed/x", r"; allowed: env_steps, loss/kl, metric/distance, return, reward/"),
         (EVALUATED, "eval/lenght", r": did you mean eval/length\?"),
     ],
 )
@@ -343,9 +343,7 @@ def test_jobs_that_need_processes_of_their_own_are_not_packed(override: str, sai
     require_packable(SweepConfig(pack="auto"), jobs)
     assert most_together(SweepConfig(pack="auto"), jobs[1], jobs) == 1
     require_packable(SweepConfig(pack="vmap"), jobs[:1])
-    with pytest.raises(
-        ConfigError, match=f"job 1 has {re.escape(said)}, .* allowed are auto, gmi$"
-    ):
+    with pytest.raises(ConfigError, match=f"job 1 has {re.escape(said)}, .* allowed: auto, gmi$"):
         require_packable(SweepConfig(pack="vmap"), jobs)
 
 
@@ -468,7 +466,7 @@ def test_the_ranking_has_full_windows_first_and_jobs_without_a_value_below(
     assert "".join(row[1] for row in rows) == order
     assert [row[0] for row in rows] == ["1", "2", "3", "4", "-"]
     found = {row[1]: row[3] for row in rows}
-    assert found["1"] == "-5 (12 episodes, window not full)"
+    assert found["1"] == "-5 (12 episodes, too few to compare)"
     assert (found["2"], found["3"]) == ("3", "-")
     report = read_json(tmp_path / "sweep.json")
     assert report["ranking"] == [int(number) for number in order[:4]]
@@ -493,7 +491,7 @@ def test_settings_come_first_with_the_interquartile_mean_of_their_seeds(tmp_path
     assert [row[1:] for row in settings] == [
         ["algo.learning_rate=0.0002", "21.5", "20.75 to 22.25", "4"],
         ["algo.learning_rate=0.0001", "11.5", "10.75 to 31.5", "4"],
-        ["algo.learning_rate=0.0003", "50 (windows not full)", "50 to 50", "3 of 4"],
+        ["algo.learning_rate=0.0003", "50 (too few episodes to compare)", "50 to 50", "3 of 4"],
     ]
     first = read_json(tmp_path / "sweep.json")["settings"][0]
     assert first["overrides"] == {"algo.learning_rate": "0.0002"}

@@ -340,7 +340,7 @@ def test_misuse_is_told(envs: GmijaxVectorEnv):
     [
         ({"reset_mask": [True]}, r"of type bool, shape \(1,\): expected bool, \(4,\)"),
         ({"reset_mask": [1, 0, 0, 0]}, "of type int64"),
-        ({"difficulty": 3}, r"options \['difficulty'\]: allowed is reset_mask"),
+        ({"difficulty": 3}, r"options \['difficulty'\]: allowed: reset_mask"),
     ],
 )
 def test_options_that_would_be_ignored_are_refused(
@@ -358,10 +358,14 @@ def test_options_that_would_be_ignored_are_refused(
         ("4", {}, "num_envs='4': expected a whole number"),
         (4.0, {}, "num_envs=4.0: expected a whole number"),
         (None, {}, "num_envs=None: expected a whole number"),
-        (4, {"arrays": "cupy"}, "arrays=cupy: allowed are numpy, torch, jax"),
-        (4, {"autoreset": "later"}, "autoreset=later: allowed are same_step, next_step, disabled"),
-        (4, {"api": "dm_env"}, "api=dm_env: allowed are gymnasium, sb3, rsl_rl"),
-        (4, {"render_mode": "human"}, "render_mode=human: allowed are rgb_array"),
+        (4, {"arrays": "cupy"}, "arrays=cupy: expected one of numpy, torch, jax"),
+        (
+            4,
+            {"autoreset": "later"},
+            "autoreset=later: expected one of same_step, next_step, disabled",
+        ),
+        (4, {"api": "dm_env"}, "api=dm_env: expected one of gymnasium, sb3, rsl_rl"),
+        (4, {"render_mode": "human"}, "render_mode=human: expected one of rgb_array"),
         (4, {"api": "sb3", "arrays": "jax"}, "api=sb3: its arrays are of numpy"),
         (4, {"api": "rsl_rl", "autoreset": "disabled"}, "its autoreset is same_step"),
         (4, {"api": "rsl_rl", "render_mode": "rgb_array"}, "not with api=rsl_rl"),

@@ -24,7 +24,7 @@ def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
     """
     del max_envs  # MJX-JAX has no limit.
     if impl == "warp":
-        raise ConfigError("physics.impl=warp: Brax's tasks run in JAX; allowed are auto, jax")
+        raise ConfigError("physics.impl=warp: Brax's tasks run in JAX; allowed: auto, jax")
     names = list(envs._envs)
     if name not in names:
         raise ConfigError(

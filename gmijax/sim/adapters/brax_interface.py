@@ -171,7 +171,7 @@ def _obs_size(obs: Any, name: str) -> int:
     for at, leaf in _parts(obs).items():
         if leaf.ndim > 1:
             raise ConfigError(
-                f"env.name={name}: the observation{at} has shape {leaf.shape}; allowed are vectors"
+                f"env.name={name}: the observation{at} has shape {leaf.shape}; allowed: vectors"
             )
     return sum(leaf.size for leaf in _parts(obs).values())
 

@@ -19,7 +19,7 @@ from gmijax.errors import ConfigError
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.types import PyTree
 
-_FOUND: Final = "found are files beside the task, installed packages, and folders of PYTHONPATH"
+_FOUND: Final = "imports are found beside the task, among installed packages and in PYTHONPATH"
 """Where a task's imports are looked for: the working directory is not among them."""
 
 

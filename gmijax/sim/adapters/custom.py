@@ -64,8 +64,7 @@ def make(
         module = attempt(f"env={path}", load_module, path, source_sha256)
         found = getattr(module, function, None)
         if not callable(found):
-            names = [key for key, value in vars(module).items() if inspect.isfunction(value)]
-            near = suggestion(function, names)
+            near = suggestion(function, _own_functions(module))
             raise ConfigError(f"env={name}: no function {function} there{near}")
         for group in given:
             _require_argument(found, group, what)
@@ -76,6 +75,12 @@ def make(
         env = check_env(env, what)
         check_start(env, what)
     return env
+
+
+def _own_functions(module: ModuleType) -> list[str]:
+    """Names of the functions that a module defines, without those that it imports."""
+    found = inspect.getmembers(module, inspect.isfunction)
+    return [name for name, function in found if function.__module__ == module.__name__]
 
 
 def _with_arrays(env: Env) -> Env:

@@ -68,7 +68,7 @@ def make(
         changed["impl"], _ = choose_impl(impl, jax.default_backend(), label)
         changed = _buffers(registry, task, config, max_envs) | changed
     elif impl == "warp":
-        raise ConfigError(f"physics.impl=warp: {name} has MJX-JAX only; allowed are auto, jax")
+        raise ConfigError(f"physics.impl=warp: {name} has MJX-JAX only; allowed: auto, jax")
     theirs = attempt(f"env.name={name}", registry.load, task, config_overrides=changed)
     env = from_playground(theirs, name=label, episode_length=config.episode_length)
     if has_randomizer(task):

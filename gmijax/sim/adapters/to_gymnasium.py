@@ -107,7 +107,7 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
         """
         options = options or {}
         if unknown := options.keys() - {RESET_MASK}:
-            raise gym.error.Error(f"options {sorted(unknown)}: allowed is {RESET_MASK}")
+            raise gym.error.Error(f"options {sorted(unknown)}: allowed: {RESET_MASK}")
         keys = self._keys(seed)
         if RESET_MASK in options:
             mask = self._mask(options[RESET_MASK])
