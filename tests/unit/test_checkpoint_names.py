@@ -122,7 +122,7 @@ def test_a_job_that_was_stopped_says_how_to_continue_if_it_can(
     # That training had not begun is said by the error already.
     assert what_is_left(config, run) == "there is no checkpoint"
     run.metrics.write_text('{"env_steps": 64}\n')
-    assert "run.stop_timeout_s is the time that GMIs get" in what_is_left(config, run)
+    assert "no checkpoint was saved: GMIs have run.stop_timeout_s" in what_is_left(config, run)
     save(run, 64)
     command = f"continue: gmijax train {words} run.dir={tmp_path} run.resume=auto"
     assert what_is_left(config, run) == command
