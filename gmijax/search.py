@@ -8,24 +8,22 @@ from collections.abc import Sequence
 from gmijax.cli.command import command
 from gmijax.cli.compose import build
 from gmijax.config import TrainConfig
-from gmijax.config.schema import to_dict
 from gmijax.control import searching
 from gmijax.control.console import Show
 
 
 def main(argv: list[str]) -> int:
     """Returns the exit code."""
+    given: list[str] = []
 
-    def make(overrides: Sequence[str]) -> tuple[TrainConfig, Sequence[str]]:
-        return build("search", TrainConfig, overrides), overrides
+    def make(overrides: Sequence[str]) -> TrainConfig:
+        given.extend(overrides)
+        return build("search", TrainConfig, overrides)
 
-    def run(made: tuple[TrainConfig, Sequence[str]], *, show: Show) -> None:
-        config, overrides = made
-        searching.search(config, show=show, overrides=overrides)
+    def run(config: TrainConfig, *, show: Show) -> None:
+        searching.search(config, show=show, overrides=given)
 
-    return command(
-        "search", TrainConfig, run, argv, make=make, shown=lambda made: to_dict(made[0])
-    )
+    return command("search", TrainConfig, run, argv, make=make)
 
 
 if __name__ == "__main__":

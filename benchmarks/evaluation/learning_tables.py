@@ -128,10 +128,10 @@ def returns(calls: Calls) -> Rows:
     for task, (call, _) in sorted(calls.items()):
         rows = call.results["rows"]
         mark = NEARLY * rows[0]["return"][1] if rows and rows[0]["return"] else None
-        ends = [curve[-1] for row in rows for curve in _curves(row)]
+        curves = [curve for row in rows for curve in _curves(row)]
         # What every run has: the least steps, and the least seconds.
-        equal_steps = min((steps for steps, *_ in ends), default=0)
-        equal_s = min((_trained_s(curve) for row in rows for curve in _curves(row)), default=0.0)
+        equal_steps = min((curve[-1][0] for curve in curves), default=0)
+        equal_s = min((curve[-1][1] - curve[0][1] for curve in curves), default=0.0)
         for row in rows:
             yield _beside(task, row, mark, equal_steps, equal_s)
 
@@ -139,11 +139,6 @@ def returns(calls: Calls) -> Rows:
 def _curves(row: Mapping[str, Any]) -> list[Curve]:
     """Of its seeds, also of those that were stopped."""
     return [one["curve"] for one in (*row["each"], *row["cut"]) if one["curve"]]
-
-
-def _trained_s(curve: Curve) -> float:
-    """From its first line to its last one."""
-    return curve[-1][1] - curve[0][1]
 
 
 def _beside(

@@ -1,12 +1,11 @@
 """Training speed beside other libraries: `python -m benchmarks.peers`.
 
-The same training by `gmijax.train` and by Brax's PPO (or by mjlab: a task that is near;
-or by FastTD3, beside our SAC), in turn, each
-alone on the GPU in processes of its own. Both count alike: steps per second from the first report
-behind a fifth of the steps to the last one, and seconds of the whole command. All programs are
-compiled before, in short runs at the same time, so no command compiles. Adds a call to
-`benchmarks/results/peers-<device>.json`, after every run. Overrides that are given change both
-sides, e.g. `num_envs=8192`. Comparisons that lack a package are left out.
+The same training by `gmijax.train` and by Brax's PPO (or by mjlab: a task that is near; or by
+FastTD3, beside our SAC), in turn, each alone on the GPU in processes of its own. Both count alike:
+steps per second from the first report behind a fifth of the steps to the last one, and seconds of
+the whole command. All programs are compiled before, in short runs at the same time, so no command
+compiles. Adds a call to `benchmarks/results/peers-<device>.json`, after every run. Overrides that
+are given change both sides, e.g. `num_envs=8192`. Comparisons that lack a package are left out.
 """
 
 from __future__ import annotations

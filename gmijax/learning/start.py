@@ -205,15 +205,13 @@ def begin_episodes(
     step_bytes += jnp.dtype(jnp.float32).itemsize  # The reward.
     env_bytes = num_runs * sum(leaf.size * leaf.dtype.itemsize for leaf in state)
     all_step_bytes = num_runs * num_envs * step_bytes
+    least_bytes = env_bytes + kept_steps * all_step_bytes
     limit_bytes = _memory_bytes()
-    if (
-        limit_bytes is not None
-        and (least := env_bytes + kept_steps * all_step_bytes) > limit_bytes
-    ):
-        need, have = (f"{num_bytes / 2**30:.3g} GiB" for num_bytes in (least, limit_bytes))
+    if limit_bytes is not None and least_bytes > limit_bytes:
+        need, have = (f"{num_bytes / 2**30:.3g} GiB" for num_bytes in (least_bytes, limit_bytes))
         them = "them" if num_runs == 1 else f"those of {num_runs} runs"
         most_steps = int((limit_bytes - env_bytes) / all_step_bytes)
-        most_envs = int(limit_bytes * num_envs / least)
+        most_envs = int(limit_bytes * num_envs / least_bytes)
         fits = [f"{kept_key} up to {most_steps}"] * (most_steps > 0)
         fits += [f"num_envs less than {most_envs}"] * (most_envs > 1)
         raise ConfigError(

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,11 @@ from gmijax.autotune.workloads import SynchronousWorkload, Workload
 from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
 from gmijax.control import searching
+from gmijax.control.console import Show, open_console
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.machine.host_limits import HostLimits
 from gmijax.machine.snapshot import Machine
+from gmijax.search import main as search_command
 
 Answer = Callable[[Point], Measured | NotRunnable]
 GRID = ("search.gmis_per_gpu=[4,2,1]", "search.num_envs=[64,128]")
@@ -275,3 +277,21 @@ def test_a_search_ends_with_the_training_that_follows(
     config = compose(*overrides, "num_envs=auto", command="search")
     found = SearchResult(None, 4, 64, "warp", "", {}, trainers)
     assert searching.following(config, overrides, found) == f"gmijax train {line}"
+
+
+@pytest.mark.parametrize(("words", "is_named"), [(["num_envs=auto"], True), (["env=ant"], False)])
+def test_the_command_names_a_task_that_nobody_chose(
+    words: list[str],
+    is_named: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def say(_: TrainConfig, *, show: Show, overrides: Sequence[str]) -> None:
+        assert list(overrides) == words
+        open_console(show=show).print("run folder: x")
+
+    monkeypatch.setattr(searching, "search", say)
+    assert search_command(words) == 0
+    *first, last = capsys.readouterr().out.splitlines()
+    assert last == "run folder: x"
+    assert [line.partition(",")[0] for line in first] == ["task: ball_balance"] * is_named
