@@ -24,6 +24,7 @@ from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_ca
 from benchmarks.outcomes import Curve, seconds_to
 from benchmarks.records import Call, calls_by_date
 from benchmarks.walking import OURS, SCRIPT
+from gmijax.sim.robots import robot_name
 
 NEARLY = 0.9
 """Of a return, that is reached more surely than all of it."""
@@ -186,11 +187,13 @@ def throughput() -> Rows:
 
 
 def _kind_of_walking(call: Call) -> tuple[str, str, str | None, bool]:
-    """Task, algorithm of our trainings as it is written, GPU and start."""
+    """Task or robot, algorithm of our trainings as it is written, GPU and start."""
     assert call.settings is not None
     given = dict(word.split("=", 1) for word in call.settings["overrides"])
     algo = given.get("algo", "ppo").upper()
-    return call.results["task"], algo, call.device, call.settings["cold"]
+    task = call.results["task"]
+    robot = robot_name(task.removeprefix("playground/"))
+    return robot or task, algo, call.device, call.settings["cold"]
 
 
 @table_of_calls(

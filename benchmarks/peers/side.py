@@ -39,8 +39,11 @@ _OF_FAST_TD3: Mapping[str, str] = {
     "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
     "JAX_DEFAULT_MATMUL_PRECISION": "highest",
     "OMP_NUM_THREADS": "1",
+    # PyTorch 2.11 cannot compile how observations are normalised: Triton refuses the kernel.
+    "TORCHINDUCTOR_PERSISTENT_REDUCTIONS": "0",
 }
-"""What its script sets, too late for a process that has imported JAX and PyTorch."""
+"""What its script sets, too late for a process that has imported JAX and PyTorch; and a kind of
+kernel that PyTorch's compiler is to leave out."""
 
 
 class Side(NamedTuple):

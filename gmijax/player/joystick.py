@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from gmijax.config import EnvConfig
 from gmijax.config.env import ROBOTS as NAMES
-from gmijax.sim.robots import robot_name
+from gmijax.sim.robots import PUSH_STRENGTH, robot_name
 
 EDGE_M: Final = 9.5
 """Rough terrain ends 10 m from its middle, and beyond it is nothing."""
@@ -99,9 +99,14 @@ def robot_of(env: EnvConfig) -> Robot | None:
 
 
 def with_pushes(env: EnvConfig, robot: Robot) -> EnvConfig:
-    """The task with pushes, as the walking test has it."""
+    """The task with its own pushes, as the walking test has it, however strong a run had them."""
     key = "push" if env.name in NAMES else f"{robot.pushes}.enable"
-    return dataclasses.replace(env, settings={**env.settings, key: 1.0})
+    return dataclasses.replace(env, settings={**with_own_pushes(env.settings), key: 1.0})
+
+
+def with_own_pushes(settings: Mapping[str, float]) -> dict[str, float]:
+    """A robot's settings with pushes as strong as the task has them, where it has any."""
+    return {name: value for name, value in settings.items() if name not in PUSH_STRENGTH}
 
 
 def part_sizes(robot: Robot, num_joints: int) -> tuple[tuple[str, int], ...]:

@@ -41,6 +41,11 @@ class RobotSettings(TaskSettings):
         default=3.0,
         low=0,
     )
+    tracking_sigma: float = doc(
+        "an error e in following the command earns exp(-e^2 / this); m^2/s^2, rad^2/s^2",
+        default=0.25,
+        positive=True,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -50,7 +55,10 @@ class RobotSettings(TaskSettings):
 
     def overrides(self) -> dict[str, Any]:
         """Keys of Playground's configuration, with dots, and their values."""
-        return {"action_scale": self.action_scale_rad}
+        return {
+            "action_scale": self.action_scale_rad,
+            "reward_config.tracking_sigma": self.tracking_sigma,
+        }
 
     def _pushes(self, group: str, strength: str) -> dict[str, Any]:
         return {
@@ -171,6 +179,8 @@ _SPOT_NOISE: Mapping[str, float] = MappingProxyType(
 )
 _SPOT_FEET_NOISE = (0.01, 0.005, 0.02)
 
+PUSH_STRENGTH = ("push_min_m_per_s", "push_max_m_per_s")
+
 ROBOT_SETTINGS: Mapping[str, type[RobotSettings]] = MappingProxyType(
     {
         "go1": Go1Settings,
@@ -208,10 +218,16 @@ def robot_name(name: str) -> str | None:
 
 
 def changed_settings(env: EnvConfig) -> dict[str, float]:
-    """A robot's settings that are not the task's own, whether there are pushes left out."""
+    """A robot's settings that are not the task's own, those of pushes and rewards left out.
+
+    The walking test has the task's own pushes, and asks for no reward.
+    """
     defaults = vars(ROBOT_SETTINGS[str(env.name)]()) if env.name in ROBOT_SETTINGS else {}
     return {
         name: value
         for name, value in env.settings.items()
-        if value != defaults.get(name) and name != "push" and not name.endswith(".enable")
+        if value != defaults.get(name)
+        and name not in ("push", *PUSH_STRENGTH, "tracking_sigma")
+        and not name.endswith(".enable")
+        and not name.startswith("reward_config.")
     }

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from gmijax.config import EnvConfig, ExportConfig
 from gmijax.config.schema import from_dict
 from gmijax.player.deployment import deployment_of
-from gmijax.player.joystick import part_sizes, robot_of
+from gmijax.player.joystick import part_sizes, robot_of, with_own_pushes
 from gmijax.runs.folder import ExportPaths, read_json, write_bytes, write_json
 from gmijax.runs.saved_config import trained_config
 from gmijax.sim.robots import changed_settings
@@ -76,7 +76,9 @@ def _robot(config: EnvConfig, env: Env, obs_size: int) -> dict[str, Any]:
     parts = part_sizes(robot, env.spec.action_size)
     if obs_size != config.history * sum(length for _, length in parts):
         return {}
-    task = deployment_of(robot, env.mj_model, configuration(str(config.name), config.settings))
+    # The exported policy is tested as the trained one: with the task's own pushes.
+    settings = with_own_pushes(config.settings)
+    task = deployment_of(robot, env.mj_model, configuration(str(config.name), settings))
     return {
         "obs_terms": list(map(list, parts)) * config.history,
         "robot": {

@@ -204,10 +204,18 @@ def test_what_is_written_here_is_what_playground_has(name: str) -> None:
         assert defaults[key] == pytest.approx(value), key
     assert gmijax.compose(f"env={name}").env.rewards == dict(config.reward_config.scales)
     assert config.episode_length == 1000
-    least = {field: 0.0 for field in vars(ROBOT_SETTINGS[name]()) if "scale" not in field}
-    changed = ROBOT_SETTINGS[name](**least).overrides()
+    positive = ("scale", "sigma")
+    least = {
+        field: 0.0
+        for field in vars(ROBOT_SETTINGS[name]())
+        if not any(word in field for word in positive)
+    }
+    changed = ROBOT_SETTINGS[name](**least, tracking_sigma=0.5).overrides()
     config.lock().update_from_flattened_dict(changed)
-    assert not any(np.any(flatten(config.to_dict())[key]) for key in changed if "scale" not in key)
+    found = flatten(config.to_dict())
+    zero = [key for key in changed if not any(word in key for word in positive)]
+    assert not any(np.any(found[key]) for key in zero)
+    assert found["reward_config.tracking_sigma"] == 0.5
 
 
 @pytest.mark.parametrize("name", ROBOTS)

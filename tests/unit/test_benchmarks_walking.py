@@ -237,11 +237,12 @@ def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypat
     assert TABLES["walking"]() == [NOT_MEASURED]
     row = {"seeds": 5, "walk": 5, "env_steps": [4e7, 5e7, 6e7]}
     sac = ["env=go1", "algo=sac"]
-    for is_cold, seconds, given in (
-        (False, 99.0, []),
-        (False, 60.0, ["env=go1"]),
-        (True, 100.0, []),
-        (False, 70.0, sac),
+    for is_cold, seconds, given, task in (
+        # Playground's name is the same robot's.
+        (False, 99.0, [], "playground/Go1JoystickFlatTerrain"),
+        (False, 60.0, ["env=go1"], "go1"),
+        (True, 100.0, [], "go1"),
+        (False, 70.0, sac, "playground/Go1JoystickFlatTerrain"),
     ):
         path = tmp_path / "walking-go1-nvidia-h100.json"
         settings = {"cold": is_cold, "overrides": given}
@@ -251,9 +252,9 @@ def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypat
         tested = {"env_steps": 7e7, "walk": {"upright": 0.995, "settled": errors}}
         runs = [{"trainer": "gmijax", "checkpoints": [tested, {"env_steps": 8e7}]}] * 5
         with file.changing() as results:
-            results.update(task="go1", rows={"gmijax": row | spread}, runs=runs)
+            results.update(task=task, rows={"gmijax": row | spread}, runs=runs)
     lines = TABLES["walking"]()
-    rows = [line for line in lines if line.startswith("| `go1`")]
+    rows = [line for line in lines if line.startswith("| `")]
     walk, share, most = "5 of 5 | 50 (40 to 60)", "70 | 99.5%", "(50 to 120)"
     assert rows == [
         f"| `go1` | gmijax PPO | from the cache | {walk} | 60 {most} |  | {share} | 0.06 |  |",

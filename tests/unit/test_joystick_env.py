@@ -235,7 +235,10 @@ def test_an_export_has_the_layout_unless_the_policy_sees_what_no_robot_does(mode
     spec = SimpleNamespace(action_size=12)
     env: Any = SimpleNamespace(spec=spec, mj_model=theirs.mj_model)
     config = EnvConfig(
-        suite="playground", name="go1", episode_length=None, settings={"action_scale_rad": 0.3}
+        suite="playground",
+        name="go1",
+        episode_length=None,
+        settings={"action_scale_rad": 0.3, "push_max_m_per_s": 9.0},
     )
     found = json.loads(json.dumps(_robot(config, env, 48)))
     assert sum(length for _, length in found["obs_terms"]) == 48
@@ -244,6 +247,7 @@ def test_an_export_has_the_layout_unless_the_policy_sees_what_no_robot_does(mode
     assert (about["history"], about["action_repeat"]) == (1, 1)
     assert about["settings"] == {"action_scale_rad": 0.3}
     assert (about["phase"], about["pushes"]["enabled"]) == (None, False)
+    assert about["pushes"]["velocity_kick_m_per_s"] == [0.0, 3.0]
     assert about["default_pose_rad"][:3] == pytest.approx([0.1, 0.9, -1.8])
     assert set(about["kp_n_m_per_rad"]) == {35.0}
     assert about["torque_limit_n_m"][:3] == pytest.approx([23.7, 23.7, 35.55])

@@ -84,7 +84,11 @@ def test_a_policy_does_not_walk_if_more_than_half_leave_the_field():
 def test_settings_that_are_not_the_tasks_own_are_printed():
     walk = walk_of(standing())
     assert not any("settings" in line for line in lines_of(walk.as_json()))
-    settings = {"noise": 0.0, "command_forward_m_per_s": 0.3, "push": 1.0, "push_max_m_per_s": 3.0}
+    settings = {
+        **{"noise": 0.0, "command_forward_m_per_s": 0.3},
+        # The test has the task's own pushes and no reward.
+        **{"push": 1.0, "push_max_m_per_s": 9.0, "tracking_sigma": 0.5},
+    }
     env = EnvConfig(suite="playground", name="go1", episode_length=None, settings=settings)
     changed = changed_settings(env)
     lines = lines_of(walk._replace(settings=changed).as_json())
@@ -217,6 +221,12 @@ def test_every_joystick_task_has_a_robot_and_a_key_that_turns_its_pushes_on():
         key = f"{robot.pushes}.enable"
         given = dataclasses.replace(env, name=theirs, settings={key: 0.0})
         assert with_pushes(given, robot).settings == {key: 1.0}
+
+
+def test_pushes_of_the_test_are_those_of_the_task_however_the_run_was_trained():
+    settings = {"noise": 0.5, "push_min_m_per_s": 1.0, "push_max_m_per_s": 9.0}
+    env = EnvConfig(suite="playground", name="go1", episode_length=None, settings=settings)
+    assert with_pushes(env, ROBOTS["go1"]).settings == {"noise": 0.5, "push": 1.0}
 
 
 def test_heights_are_where_a_ray_of_mujoco_hits_the_ground():
