@@ -49,6 +49,27 @@ class PlayRunConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExportRunConfig(PlayRunConfig):
+    """The run whose policy is exported."""
+
+    env: str | None = doc(
+        "the run's custom task, PATH.py:FUNCTION, where its file has changed or moved since; env= "
+        "is short for it; null: as the run noted it",
+        default=None,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRunConfig(PlayRunConfig):
+    """The run whose policy is shown."""
+
+    env: str | None = doc(
+        "the task, with checkpoint=shipped; env= is short for it; null: that of the run",
+        default=None,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlayConfig(KeyGroup):
     """Everything that `python -m gmijax.play` can be told."""
 
@@ -115,7 +136,7 @@ class PlayConfig(KeyGroup):
 class ExportConfig(KeyGroup):
     """Everything that `python -m gmijax.export` can be told."""
 
-    run: PlayRunConfig
+    run: ExportRunConfig
     checkpoint: str | None = doc(
         "folder of a checkpoint, its env steps, or `best`; null: the latest"
     )

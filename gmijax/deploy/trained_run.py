@@ -25,7 +25,7 @@ from gmijax.runs.resume import (
 )
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
-from gmijax.sim.registry import require_env
+from gmijax.sim.registry import require_env, require_own
 
 C = TypeVar("C", PlayConfig, ExportConfig, ViewConfig)
 
@@ -58,6 +58,8 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
             "checkpoint=best: none has an evaluation or a full window of episodes to compare by"
         )
     saved, _ = trained_config(checkpoint)
+    if isinstance(config, ViewConfig):  # Before its file is asked for: it is not executed.
+        require_own(saved)
     env = source.opened(saved, config.run.env)
     require_env(env)
     run = dataclasses.replace(config.run, dir=str(checkpoint.parents[1]))
