@@ -76,9 +76,9 @@ class PlayConfig(KeyGroup):
     run: PlayRunConfig
     physics: PhysicsConfig
     checkpoint: str | None = doc(
-        "folder of a checkpoint, its env steps, or `best`: the one with the best return, in an "
-        "evaluation if there are any; null: the latest. `shipped`, with env=TASK: the policy that "
-        "comes with gmijax, in MuJoCo in C"
+        "folder of a checkpoint, its env steps, or `best`: the one with the best return, in "
+        "evaluations (eval.every), else in the training around it; null: the latest. `shipped`, "
+        "with env=TASK: the policy that comes with gmijax, in MuJoCo in C"
     )
     num_envs: int = doc("N, environments, one episode each", low=1)
     seed: int = doc("seed of the episodes' starts and of sampled actions", low=0, high=2**31 - 1)
@@ -138,7 +138,8 @@ class ExportConfig(KeyGroup):
 
     run: ExportRunConfig
     checkpoint: str | None = doc(
-        "folder of a checkpoint, its env steps, or `best`; null: the latest"
+        "folder of a checkpoint, its env steps, or `best`: the one with the best return, in "
+        "evaluations (eval.every), else in the training around it; null: the latest"
     )
     format: Literal["onnx", "stablehlo", "all"] = doc(
         "what to write: onnx for ONNX Runtime and others, stablehlo for jax.export, or all"

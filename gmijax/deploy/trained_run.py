@@ -14,13 +14,12 @@ from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import META, RunPaths, remove_temporary, write_json
 from gmijax.runs.names import steps_name
+from gmijax.runs.ranking import best_checkpoint, ranked
 from gmijax.runs.resume import (
     CheckpointMeta,
-    best_checkpoint,
     checkpoints_of,
     find_checkpoint,
     first_checkpoint_of,
-    rank_of,
     unsaved_runs,
 )
 from gmijax.runs.saved_config import left_out, trained_config
@@ -53,7 +52,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     checkpoint = checkpoint_of(config)
     early = None
     is_last = config.checkpoint in (None, "best") and config.run.dir in (None, "last")
-    if config.checkpoint == "best" and not rank_of(checkpoint).is_full:
+    if config.checkpoint == "best" and not ranked([checkpoint])[0][0].is_full:
         early = (
             "checkpoint=best: none has an evaluation or a full window of episodes to compare by"
         )

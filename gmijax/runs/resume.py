@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
-import math
 import os
 import shutil
 import zlib
@@ -56,6 +55,8 @@ class CheckpointMeta:
     eval_return: float | None = None
     # Whether `mean_return` is over enough episodes; not known of older versions.
     window_full: bool = False
+    # A time limit of all its environments together, in environment steps; None: not known.
+    limit_steps: float | None = None
     # As the run was told, that of the schedule is in the learner's state.
     learning_rate: float | None = None
     # When it was written, seconds since 1970: files get new times when a run is copied.
@@ -124,46 +125,6 @@ def newest_checkpoint(folder: Path) -> NewestCheckpoint:
             return NewestCheckpoint(checkpoint.resolve(), tuple(passed_over))
         passed_over.append(f"checkpoint {checkpoint}: passed over, {wrong}")
     return NewestCheckpoint(None, tuple(passed_over))
-
-
-def best_checkpoint(folder: Path) -> Path | None:
-    """The best checkpoint of a run folder, by `rank_of`, whose files are as they were written."""
-    ranked = sorted(reversed(checkpoints_of(folder)), key=rank_of, reverse=True)
-    return next((path.resolve() for path in ranked if what_is_broken(path) is None), None)
-
-
-def best_evaluation(folder: Path, env_steps: int) -> float:
-    """The best mean return of the evaluations of a run folder up to `env_steps`, -inf for none.
-
-    Of those that have a checkpoint, and the best one always has.
-    """
-    found = (rank_of(path) for path in checkpoints_of(folder) if int(path.name) <= env_steps)
-    return max((rank.value for rank in found if rank.is_evaluated), default=-math.inf)
-
-
-class Rank(NamedTuple):
-    """What checkpoints are ranked by; the best one has the largest.
-
-    One without an evaluation comes after all that have one. Its mean return in training counts
-    after all those of full windows where its own window is not: at the start of a run it is of
-    short episodes alone.
-    """
-
-    is_evaluated: bool
-    is_full: bool
-    value: float
-
-
-def rank_of(checkpoint: Path) -> Rank:
-    """The rank of a checkpoint."""
-    try:
-        meta = CheckpointMeta.read(checkpoint)
-    except ConfigError:
-        return Rank(False, False, -math.inf)
-    if meta.eval_return is not None:
-        return Rank(True, True, meta.eval_return)
-    mean = -math.inf if meta.mean_return is None else meta.mean_return
-    return Rank(False, meta.window_full, mean)
 
 
 def what_is_broken(checkpoint: Path) -> str | None:

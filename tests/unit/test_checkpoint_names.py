@@ -20,10 +20,9 @@ from gmijax.learning.checkpoint import finish_checkpoint
 from gmijax.runs.dataset import DataPaths
 from gmijax.runs.folder import META, RunPaths, write_json
 from gmijax.runs.names import attempt_folders, by_steps, gmi_folders, steps_name, steps_of
+from gmijax.runs.ranking import best_checkpoint, best_evaluation
 from gmijax.runs.resume import (
     CheckpointMeta,
-    best_checkpoint,
-    best_evaluation,
     checkpoints_of,
     choose_checkpoint,
     last_run,
