@@ -13,8 +13,8 @@ from gmijax.supervise.watched_gmi import GmiStatus
 BEFORE_RUNNING: Final = ("starting", "waiting", "compiling")
 
 _STOPPING: Final = (
-    "stopping: finishing the iterations that have begun, then saving; a second Ctrl-C ends at "
-    "once, without saving"
+    "stopping: finishing the iterations that have begun, then saving; a second {} ends at once, "
+    "without saving"
 )
 
 _LONG_S: Final = 180.0
@@ -45,7 +45,7 @@ class Phases:
         now_s = time.monotonic()
         took_s, self.now, self._began_s = now_s - self._began_s, phase, now_s
         if phase == "stopping":
-            return _STOPPING
+            return _STOPPING.format(next(filter(None, (gmi.stopped_by for gmi in gmis)), "Ctrl-C"))
         if (before, phase) != ("compiling", "running"):
             return None
         if self._compile_time is not None and not self._is_noted:

@@ -168,7 +168,7 @@ def _run_jobs(
             if not hinted and (hint := work.hint(report.data)):
                 hinted.append(hint)  # At the end it is said once more.
                 console.print(hint)
-            view.update(is_stopping=signals.have_come)
+            view.update(signals.name)
             job_events.update()
 
         Scheduler(

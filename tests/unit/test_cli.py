@@ -101,10 +101,10 @@ REFUSED: list[tuple[str, str, str]] = [
         "cluster.engine: this command is for one machine",
     ),
     ("play", "vidoe=gif", "unknown key vidoe: did you mean video?"),
-    ("play", "env.name=ant", "unknown key env"),
+    ("play", "env.name=ant", "env.name: this command takes the task"),
     ("play", "env=ant", "env=ant: a run knows its task; add checkpoint=shipped"),
     ("play", "env=antt checkpoint=shipped", "env=antt: no policy of it is shipped"),
-    ("export", "env=ant", "unknown key env: did you mean run.env?"),
+    ("export", "env=ant", "env: this command takes the task and the policy"),
     ("export", "run.env=ant", "env=ant: a run knows its task\n"),
     ("export", "run.dir=x tuned=ant_ppo", "unknown key tuned; allowed: checkpoint"),
     # Values of a wrong type, or out of range.
@@ -171,6 +171,17 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "env=ant env.rewards.enrgy=1", "env.rewards.enrgy: did you mean energy?"),
     ("train", "env=anymal env.rewards.x=1", "env.rewards.x; allowed: torque, velocity, y"),
     ("train", "env=brax env.name=ant env.rewards.x=1", "x: this task has none in env.rewards"),
+    *(
+        (command, key, "this command takes the task and the policy as the run was trained")
+        for command in ("play", "export", "view")
+        for key in (
+            "env.rewards.spin=-0.01",
+            "env.episode_length=5",
+            "env.settings.x=1",
+            "algo=ppo",
+        )
+    ),
+    ("play", "env.randomize=on", "unknown key env.randomize: did you mean randomize?"),
     ("train", "env=ant env.rewards.energy=low", "env.rewards.energy=low: expected a finite num"),
     ("train", "env=ant env.settings.goal_m=1", "unknown key env.settings.goal_m; allowed:"),
     ("train", "env=ant +env.settings.goal_m=1", "unknown key env.settings.goal_m; allowed:"),
