@@ -40,7 +40,7 @@ from gmijax.runs.folder import (
 )
 from gmijax.runs.held import OpenFolder, gone_if_unused, locked
 from gmijax.runs.history import MetricsReader, read_metrics
-from gmijax.runs.resume import CheckpointMeta, find_checkpoint, is_training
+from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, find_checkpoint, is_training
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import serving_kind
@@ -157,6 +157,9 @@ def _prepared(config: ServeConfig, console: Console) -> _ServingJob:
     require_new_run(None, config.run.name)  # Before a search, which takes minutes.
     if config.run.dir is not None and (notice := source.executed(config.env)):
         console.print(notice)
+    newer = ()
+    if config.run.dir == "last":
+        _, newer = choose_checkpoint(config.run.dir, "run.dir")
     config, plan, machine, reasons = decide(_with_checkpoint(config), console)
     data = None
     if config.output.dir is not None:
@@ -167,7 +170,7 @@ def _prepared(config: ServeConfig, console: Console) -> _ServingJob:
     assert group is not None
     if config.run.dir is not None and (unknown := left_out(Path(config.run.dir))):
         reasons = (*reasons, unknown)
-    return _ServingJob(config, plan, machine, group.gmis, data, reasons)
+    return _ServingJob(config, plan, machine, group.gmis, data, (*reasons, *newer))
 
 
 def _with_checkpoint(config: ServeConfig) -> ServeConfig:

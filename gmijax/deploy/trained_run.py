@@ -20,6 +20,7 @@ from gmijax.runs.resume import (
     checkpoints_of,
     find_checkpoint,
     first_checkpoint_of,
+    newer_than,
     unsaved_runs,
 )
 from gmijax.runs.saved_config import left_out, trained_config
@@ -71,6 +72,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
         left_out(checkpoint),
         early,
         *(f"{run}: {first_checkpoint_of(run)}" for run in (unsaved_runs() if is_last else ())),
+        *(newer_than(checkpoint) if is_last else ()),
     )
     return config, env, "\n".join(filter(None, notes)) or None
 

@@ -26,7 +26,7 @@ from gmijax.runs.folder import (
     read_json,
 )
 from gmijax.runs.held import is_locked
-from gmijax.runs.names import by_steps, steps_name, steps_of
+from gmijax.runs.names import by_steps, nearby, steps_name, steps_of
 
 _CHUNK_BYTES: Final = 1 << 20
 
@@ -183,6 +183,9 @@ def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
             raise ConfigError(f"{key}={wanted}: {wrong}")
         return folder.resolve(), ()
     found = newest_checkpoint(folder)
+    if wanted == "last" and found.checkpoint is not None:
+        newer = newer_than(found.checkpoint)
+        return found.checkpoint, (*found.passed_over, *newer)
     if found.checkpoint is None:
         if not found.passed_over and is_training(folder):
             raise NoCheckpointYet(f"{key}={wanted}: {first_checkpoint_of(folder)}")
@@ -253,6 +256,40 @@ def last_run(key: str) -> Path:
 def unsaved_runs() -> list[Path]:
     """The run folders below `RUNS` that are being trained and have no checkpoint yet."""
     return [run for run in _folders_in(RUNS) if is_training(run) and not checkpoints_of(run)]
+
+
+def newer_than(checkpoint: Path) -> tuple[str, ...]:
+    """What `last` has passed over below `RUNS` for a checkpoint, in a line; empty: nothing newer.
+
+    Runs without a checkpoint that have ended, and sweeps, in whose folders the runs are.
+    """
+    since_s, named = _written_s(checkpoint)[0], list[str]()
+    for folder in _folders_in(RUNS):
+        jobs = [path for job in _folders_in(folder) for path in checkpoints_of(job)[-1:]]
+        if jobs and max(_written_s(path)[0] for path in jobs) > since_s:
+            newest = max(jobs, key=_written_s).parents[1]
+            named.append(f"{folder} (a sweep; its newest run: {newest})")
+        elif _is_unsaved_training(folder) and _begun_s(folder) > since_s:
+            named.append(f"{folder} (no checkpoint)")
+    if not named:
+        return ()
+    more = f", and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
+    run = nearby(checkpoint.parents[1])
+    return (f"last is {run}; newer, but passed over: {', '.join(named[:_MOST_NAMED])}{more}",)
+
+
+def _is_unsaved_training(folder: Path) -> bool:
+    """Whether a training run has ended in a folder without a checkpoint."""
+    paths = RunPaths(folder)
+    if not paths.plan.exists() or checkpoints_of(folder) or is_training(folder):
+        return False
+    with suppress(ConfigError):
+        return "algo" in read_json(paths.config)  # Not so of `gmijax serve`.
+    return False
+
+
+def _begun_s(folder: Path) -> float:
+    return os.lstat(RunPaths(folder).config).st_mtime
 
 
 def is_training(folder: Path) -> bool:
