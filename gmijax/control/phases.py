@@ -61,7 +61,7 @@ class Phases:
     def _reason(self, waited_s: float) -> str:
         if self.now == "compiling":
             last_s = None if self._compile_time is None else self._compile_time.last_s
-            usual = "usually 1 to 3 minutes" if last_s is None else f"last time {clock(last_s)}"
+            usual = "up to 3 minutes" if last_s is None else f"last time {clock(last_s)}"
             if last_s is not None and last_s < 1:
                 usual = "last time less than a second"
             if waited_s > 2 * (last_s or _LONG_S):

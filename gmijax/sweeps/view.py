@@ -96,6 +96,8 @@ class SweepView:
         value = ""
         if progress.value is not None:
             found = shown(progress.value, progress.is_full, progress.episodes)
+            if progress.state == "interrupted":  # It is not compared with others yet.
+                found = f"{progress.value:.4g} so far"
             value = f", {self._ranking.objective} {found}"
         return f"{what} after {progress.wall_s:.0f} s{value}; {self.line()}"
 

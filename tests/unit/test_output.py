@@ -216,8 +216,8 @@ def test_while_it_compiles_a_job_says_why_and_for_how_long(
             shown.update(_status(*states))
     assert said.getvalue().splitlines() == [
         "starting: loading JAX, building the environments  0:00",
-        f"{WHY}usually 1 to 3 minutes  0:00",
-        f"{WHY}usually 1 to 3 minutes  0:31",
+        f"{WHY}up to 3 minutes  0:00",
+        f"{WHY}up to 3 minutes  0:31",
         "compiled in 0:42",
     ]
     assert compile_time().last_s == 42
@@ -250,7 +250,7 @@ def test_a_job_without_metrics_says_what_it_does_once_it_runs(
             clock.now_s += 20
     assert said.getvalue().splitlines() == [
         "starting: loading JAX, building the environments  0:00",
-        f"{WHY}usually 1 to 3 minutes  0:00",
+        f"{WHY}up to 3 minutes  0:00",
         "compiled in 0:20",
         "playing 16 episodes  0:00",
     ]
