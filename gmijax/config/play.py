@@ -80,7 +80,7 @@ class PlayConfig(KeyGroup):
         "evaluations (eval.every), else in the training around it; null: the latest. `shipped`, "
         "with env=TASK: the policy that comes with gmijax, in MuJoCo in C"
     )
-    num_envs: int = doc("N, environments, one episode each", low=1)
+    num_envs: int = doc("environments, one episode each", low=1)
     seed: int = doc("seed of the episodes' starts and of sampled actions", low=0, high=2**31 - 1)
     deterministic: bool = doc("act with the policy's mean; false: sample actions")
     randomize: Literal["off", "on"] = doc(

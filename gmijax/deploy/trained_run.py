@@ -47,8 +47,10 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
       ConfigError: no such run or checkpoint, or its task cannot be had.
     """
     if config.run.env is not None and ".py" not in config.run.env:
-        hint = f"; add checkpoint={SHIPPED} for the policy that comes with gmijax"
-        why = "a run knows its task" + ("" if isinstance(config, ExportConfig) else hint)
+        hint = f"; to play the policy that comes with gmijax, add checkpoint={SHIPPED}"
+        why = "not needed, a run knows its task" + (
+            "" if isinstance(config, ExportConfig) else hint
+        )
         raise ConfigError(f"env={config.run.env}: {why}")
     checkpoint = checkpoint_of(config)
     early = None
