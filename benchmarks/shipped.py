@@ -40,7 +40,8 @@ from gmijax.player.returns import Played, play
 from gmijax.player.shipped import POLICIES
 from gmijax.runs.folder import POLICY, RunPaths, read_json
 from gmijax.runs.history import read_metrics
-from gmijax.runs.resume import CheckpointMeta, best_checkpoint, newest_checkpoint
+from gmijax.runs.ranking import best_checkpoint
+from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
 from gmijax.sweeps.sweep import sweep
 
 SEED = 0

@@ -176,7 +176,9 @@ def _train(config: Any, console: Console) -> None:
     has_curve = "none, no episode has ended"
     console.print(f"\ncurve of the returns: {nearby(curve) if curve.exists() else has_curve}")
     console.print(f"film: {nearby(films[-1]) if films else 'none, see above'}")
-    print_next(console, ("train for longer", f"gmijax train env={config.env.label}"))
+    print_next(
+        console, ("train it anew with its full budget", f"gmijax train env={config.env.label}")
+    )
 
 
 if __name__ == "__main__":

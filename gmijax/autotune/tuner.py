@@ -6,6 +6,7 @@ they meet the profile store, the time budget and the console.
 
 from __future__ import annotations
 
+import shutil
 import time
 from importlib import import_module
 from pathlib import Path
@@ -137,9 +138,14 @@ class Search:
         """
         started_s = time.monotonic()
         self._deadline_s = running_s() + self._settings.budget_s
-        with self._display:
-            outcome = self._outcome()
-        best = self._require_best(outcome)
+        try:
+            with self._display:
+                outcome = self._outcome()
+            best = self._require_best(outcome)
+        except GmijaxError:
+            if self.run is not None and not self._num_profiled:  # There is no log of any.
+                shutil.rmtree(self.run.root, ignore_errors=True)
+            raise
         assert isinstance(best.result, Measured)
         workload = self._workload
         split = workload.split(best.result)
@@ -232,7 +238,11 @@ class Search:
             why = first.result.reason
             if first.result.limit_s is not None:  # It was too slow.
                 more = "; raise search.budget_s, or use smaller sizes in search.num_envs"
-        raise GmijaxError(f"no point of the search can run; the first, {first.point}: {why}{more}")
+        root = self.run.root if self.run is not None and self._num_profiled else None
+        logs = "" if root is None else f" (logs: {nearby(root)})"
+        raise GmijaxError(
+            f"no point of the search can run; the first, {first.point}: {why}{more}{logs}"
+        )
 
 
 def _grid(workload: Workload[Any], machine: Machine) -> Grid:

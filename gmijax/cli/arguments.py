@@ -73,7 +73,7 @@ def _require_joined(words: Sequence[str]) -> None:
         is_apart = len(parts) > 1 or key != key.rstrip()
         if is_apart and key and value.strip():
             joined = f"{key.rstrip()}={value.strip()}"
-            raise ConfigError(f"{' '.join(parts)}: write it without blanks: {joined}")
+            raise ConfigError(f"{' '.join(parts)}: remove the space: {joined}")
 
 
 def require_text(text: str) -> None:

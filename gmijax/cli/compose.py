@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import re
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal, TypeVar, overload
 
@@ -250,17 +250,27 @@ def _check_task_key(items: Sequence[Override]) -> None:
             raise ConfigError(f"env.name={name}: choose the task with env={name}")
 
 
-def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
+def _unknown_key(key: str, known: Collection[str]) -> ConfigError:
     group, dot, name = key.rpartition(".")
+    trained = key.partition(".")[0]
+    if trained in ("env", "algo") and name not in known and not _has_group(trained, known):
+        return ConfigError(
+            f"{key}: this command takes the task and the policy as the run was trained, with its "
+            "weights and settings; they cannot be changed here"
+        )
     if group + dot in NAMED_BY_TASK:
         names = [one.removeprefix(group + dot) for one in known if one.startswith(group + dot)]
         none = f": this task has none in {group}"
         return ConfigError(f"unknown key {key}{suggestion(name, names) if names else none}")
-    if group == "cluster" and not any(one.startswith("cluster.") for one in known):
+    if group == "cluster" and not _has_group(group, known):
         return ConfigError(
             f"{key}: this command is for one machine; gmijax.train and gmijax.sweep take several"
         )
     return ConfigError(f"unknown key {key}{near_key(key, set(known))}")
+
+
+def _has_group(group: str, known: Collection[str]) -> bool:
+    return any(one.startswith(f"{group}.") for one in known)
 
 
 def _on_top_of_saved(

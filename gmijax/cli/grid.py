@@ -6,7 +6,7 @@ import copy
 import fnmatch
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override, RangeSweep
@@ -41,6 +41,7 @@ def build_sweep(overrides: Sequence[str]) -> SweepWork:
     Raises:
       ConfigError: as `compose`; an empty list; what a sampler cannot do.
     """
+    words = without_folder(overrides)
     overrides = readable("train", overrides)
     given = list(zip(overrides, parse(overrides), strict=True))
     whole = ("run.", "sweep.", "cluster.")
@@ -67,7 +68,12 @@ def build_sweep(overrides: Sequence[str]) -> SweepWork:
 
     points = grid(space) if settings.sampler == "grid" else corners(space)
     jobs = [make_job(number, chosen) for number, chosen in enumerate(points)]
-    return sweep_of(settings, space, make_job, jobs, cluster)
+    return replace(sweep_of(settings, space, make_job, jobs, cluster), words=words)
+
+
+def without_folder(words: Sequence[str]) -> tuple[str, ...]:
+    """The overrides of a command that many jobs share, but for its folder."""
+    return tuple(word for word in words if not word.startswith(("run.dir=", "run.name=")))
 
 
 class _Composer:

@@ -26,9 +26,9 @@ USUAL: Final = (
     *("num_envs", "num_timesteps", "seed", "unroll_length", "policy"),
     *("env.randomize", "env.episode_length", "physics.impl"),
     *("algo.learning_rate", "algo.entropy_cost"),
-    *("plan.gpus", "plan.gmis_per_gpu", "plan.backend", "cluster.engine"),
+    *("plan.gpus", "plan.gmis_per_gpu", "plan.backend"),
     *("run.dir", "run.name", "run.resume", "run.checkpoint_every", "run.max_restarts"),
-    *("output.dir", "eval.every", "eval.video", "wandb.mode", "search.budget_s"),
+    *("output.dir", "eval.every", "eval.video", "wandb.mode"),
     *("sweep.jobs_per_gpu", "sweep.objective", "sweep.sampler", "sweep.trials"),
 )
 """What most people set."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hydra.core.override_parser.types import ChoiceSweep, Override, QuotedString
@@ -13,7 +13,7 @@ from hydra.core.override_parser.types import ChoiceSweep, Override, QuotedString
 from gmijax.cli.arguments import parse, quoted, readable
 from gmijax.cli.command import command
 from gmijax.cli.compose import compose_dict
-from gmijax.cli.grid import values_of
+from gmijax.cli.grid import values_of, without_folder
 from gmijax.config import ClusterConfig
 from gmijax.config.pack import PackConfig
 from gmijax.config.schema import KeyGroup, doc, from_dict, to_dict
@@ -80,6 +80,7 @@ def build_pack(words: Sequence[str], program: Sequence[str]) -> PackWork:
     for word in words:
         if "=" not in word and shutil.which(word):
             raise ConfigError(f"{word}: expected key=value; a command to run comes after --")
+    typed = (*without_folder(words), *(("--", *program) if program else ()))
     words = [_as_text(word) for word in words]
     given = list(zip(words, parse(words), strict=True))
     own = [text for text, item in given if item.key_or_group.startswith(_OWN)]
@@ -91,7 +92,7 @@ def build_pack(words: Sequence[str], program: Sequence[str]) -> PackWork:
     if len(space) < len(given) - len(own):
         raise ConfigError("a name of the grid is repeated")
     folder = Folder(keys.run.dir, keys.run.name)
-    return pack_of(keys.pack, space, program, folder, keys.cluster)
+    return replace(pack_of(keys.pack, space, program, folder, keys.cluster), words=typed)
 
 
 def _as_text(word: str) -> str:

@@ -35,8 +35,8 @@ class PlanConfig(KeyGroup):
         "number of GPUs, or their indices as nvidia-smi lists them", default=1
     )
     gmis_per_gpu: int | Literal["auto"] = doc(
-        "GMIs on every GPU (with algo=a3c 1, see serving_gmis_per_gpu and training_gmis_per_gpu); "
-        "auto: what a search finds (docs/search.md)",
+        "GMIs on every GPU; auto: the number that a search finds (docs/search.md). With algo=a3c "
+        "leave it at 1 and use plan.serving_gmis_per_gpu and plan.training_gmis_per_gpu",
         default=1,
         low=1,
     )

@@ -49,17 +49,38 @@ class PlayRunConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExportRunConfig(PlayRunConfig):
+    """The run whose policy is exported."""
+
+    env: str | None = doc(
+        "the run's custom task, PATH.py:FUNCTION, where its file has changed or moved since; env= "
+        "is short for it; null: as the run noted it",
+        default=None,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRunConfig(PlayRunConfig):
+    """The run whose policy is shown."""
+
+    env: str | None = doc(
+        "the task, with checkpoint=shipped; env= is short for it; null: that of the run",
+        default=None,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlayConfig(KeyGroup):
     """Everything that `python -m gmijax.play` can be told."""
 
     run: PlayRunConfig
     physics: PhysicsConfig
     checkpoint: str | None = doc(
-        "folder of a checkpoint, its env steps, or `best`: the one with the best return, in an "
-        "evaluation if there are any; null: the latest. `shipped`, with env=TASK: the policy that "
-        "comes with gmijax, in MuJoCo in C"
+        "folder of a checkpoint, its env steps, or `best`: the one with the best return, in "
+        "evaluations (eval.every), else in the training around it; null: the latest. `shipped`, "
+        "with env=TASK: the policy that comes with gmijax, in MuJoCo in C"
     )
-    num_envs: int = doc("N, environments, one episode each", low=1)
+    num_envs: int = doc("environments, one episode each", low=1)
     seed: int = doc("seed of the episodes' starts and of sampled actions", low=0, high=2**31 - 1)
     deterministic: bool = doc("act with the policy's mean; false: sample actions")
     randomize: Literal["off", "on"] = doc(
@@ -115,9 +136,10 @@ class PlayConfig(KeyGroup):
 class ExportConfig(KeyGroup):
     """Everything that `python -m gmijax.export` can be told."""
 
-    run: PlayRunConfig
+    run: ExportRunConfig
     checkpoint: str | None = doc(
-        "folder of a checkpoint, its env steps, or `best`; null: the latest"
+        "folder of a checkpoint, its env steps, or `best`: the one with the best return, in "
+        "evaluations (eval.every), else in the training around it; null: the latest"
     )
     format: Literal["onnx", "stablehlo", "all"] = doc(
         "what to write: onnx for ONNX Runtime and others, stablehlo for jax.export, or all"

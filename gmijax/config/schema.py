@@ -269,7 +269,8 @@ def _describe(kind: Any) -> str:
     parts: list[str] = []
     for option in _options(kind):
         if typing.get_origin(option) is Literal:
-            parts.append("one of " + ", ".join(map(str, typing.get_args(option))))
+            allowed = [str(value) for value in typing.get_args(option)]
+            parts.append(allowed[0] if len(allowed) == 1 else f"one of {', '.join(allowed)}")
         elif typing.get_origin(option) is tuple:
             inner = typing.get_args(option)[0]
             nested = typing.get_origin(inner) is tuple

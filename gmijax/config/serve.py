@@ -58,11 +58,12 @@ class ServeConfig(KeyGroup):
     )
     deterministic: bool = doc("act with the policy's mean; false: sample actions")
     num_envs: int | Literal["auto"] = doc(
-        "N, environments of every GMI that simulates; auto: what a search finds (docs/search.md)",
+        "environments in each GMI that simulates; auto: the number that a search finds "
+        "(docs/search.md)",
         low=1,
     )
     num_timesteps: int = doc("environment steps of the whole job, all GMIs together", low=1)
-    unroll_length: int = doc("T, steps of one unroll, and of one shard of experience", low=1)
+    unroll_length: int = doc("steps of one unroll, and of one shard of experience", low=1)
     latency_steps: int = doc(
         "steps timed one by one for the latency; 0: not measured", low=0, high=100_000
     )

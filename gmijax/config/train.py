@@ -41,7 +41,7 @@ class TrainConfig(KeyGroup):
     wandb: WandbConfig
     cluster: ClusterConfig = field(default_factory=ClusterConfig)
     num_envs: int | Literal["auto"] = doc(
-        "N, environments per GMI; auto: what a search finds (docs/search.md)", low=1
+        "environments in each GMI; auto: the number that a search finds (docs/search.md)", low=1
     )
     num_timesteps: int = doc("environment steps of the whole job, all GMIs together", low=1)
     seed: int = doc("seed of every random number in the job", low=0, high=2**31 - 1)

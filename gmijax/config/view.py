@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
-from gmijax.config.play import PlayRunConfig
+from gmijax.config.play import ViewRunConfig
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
 
@@ -43,7 +43,7 @@ class PageConfig(KeyGroup):
 class ViewConfig(KeyGroup):
     """Everything that `gmijax view` can be told."""
 
-    run: PlayRunConfig
+    run: ViewRunConfig
     view: PageConfig
     checkpoint: str | None = doc(
         "folder of a checkpoint, its env steps, or `best`; null: the latest, and every newer one "

@@ -42,7 +42,7 @@ def find_opengl(config: TrainConfig) -> str | None:
         return gl
     raise ConfigError(
         f"eval.video={config.eval.video}: {what_is_missing(tried)}; the last one: {said}; "
-        "allowed without it is false"
+        "without it, use eval.video=false"
     )
 
 

@@ -21,5 +21,5 @@ def large_on_cpu(config: TrainConfig, *, on_cpu: bool) -> tuple[str, ...]:
     small = " ".join((*_SMALL, *config.algo.small_keys))
     return (
         f"warning: {num_envs:,} environments for {steps:,} steps are meant for a GPU, and can "
-        f"take hours or days on the CPU; for a small try add {small}",
+        f"take hours on a CPU: the ETA follows once it trains; for a small try add {small}",
     )

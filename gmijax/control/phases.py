@@ -13,8 +13,8 @@ from gmijax.supervise.watched_gmi import GmiStatus
 BEFORE_RUNNING: Final = ("starting", "waiting", "compiling")
 
 _STOPPING: Final = (
-    "stopping: finishing the iterations that have begun, then saving; a second Ctrl-C ends at "
-    "once, without saving"
+    "stopping: finishing the iterations that have begun, then saving; a second {} ends at once, "
+    "without saving"
 )
 
 _LONG_S: Final = 180.0
@@ -45,7 +45,7 @@ class Phases:
         now_s = time.monotonic()
         took_s, self.now, self._began_s = now_s - self._began_s, phase, now_s
         if phase == "stopping":
-            return _STOPPING
+            return _STOPPING.format(next(filter(None, (gmi.stopped_by for gmi in gmis)), "Ctrl-C"))
         if (before, phase) != ("compiling", "running"):
             return None
         if self._compile_time is not None and not self._is_noted:
@@ -61,7 +61,7 @@ class Phases:
     def _reason(self, waited_s: float) -> str:
         if self.now == "compiling":
             last_s = None if self._compile_time is None else self._compile_time.last_s
-            usual = "usually 1 to 3 minutes" if last_s is None else f"last time {clock(last_s)}"
+            usual = "up to 3 minutes" if last_s is None else f"last time {clock(last_s)}"
             if last_s is not None and last_s < 1:
                 usual = "last time less than a second"
             if waited_s > 2 * (last_s or _LONG_S):

@@ -7,6 +7,7 @@ import shlex
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,8 +25,8 @@ from gmijax.runs.folder import (
     write_json,
 )
 from gmijax.runs.git import record_git
-from gmijax.runs.held import OpenFolder, gone_if_refused, locked
-from gmijax.runs.history import copy_history, draw_returns, read_metrics
+from gmijax.runs.held import OpenFolder, gone_if_unused, locked
+from gmijax.runs.history import copy_history, draw_returns
 from gmijax.runs.names import attempt_folders, gmi_folders
 from gmijax.runs.resume import (
     CheckpointMeta,
@@ -58,16 +59,22 @@ def opened(config: TrainConfig, start_point: StartPoint) -> Iterator[HeldRun]:
         notes = notes if changed is None else (changed, *notes)
     run = start_point.open(config)
 
-    def is_needless() -> bool:
-        # The next command uses one that the user has named.
-        return given_run(config.run.dir, config.run.name) is None and not has_trained(run)
-
     with (
         locked(run.lock, f"run.dir={run.root}") as folder,
-        gone_if_refused(run.root, is_needless),
+        gone_if_unused(run.root, partial(is_needless, config, run)),
     ):
         record_git(run, Path.cwd())
         yield HeldRun(run, notes, folder)
+
+
+def is_needless(config: TrainConfig, run: RunPaths) -> bool:
+    """Whether nothing is in a run folder but what a job writes when it starts.
+
+    Not one that the user has named, which the next command uses; a sweep reads how it has ended.
+    """
+    is_named = given_run(config.run.dir, config.run.name) is not None
+    has_failed = any(attempt_folders(gmi) for gmi in gmi_folders(run.root))
+    return not (is_named or has_failed or has_trained(run))
 
 
 def keep_logs(run: RunPaths, attempt: int) -> None:
@@ -134,17 +141,18 @@ def record_end(
 
 
 def what_is_left(config: TrainConfig, run: RunPaths) -> str:
-    """Says how an interrupted job can be continued."""
-    if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
-        return f"training was complete: {nearby(run.root)}"
+    """Says what an interrupted job has left, and how it can be continued."""
+    folder, result = nearby(run.root), run.gmi(0).result
+    status = read_json(result)["status"] if result.exists() else None
+    if status == "completed":
+        return f"training was complete: {folder}"
     if checkpoints_of(run.root):
         # Task and algorithm are those of the command: without them the defaults are compared.
         job = f"{config.env.words} algo={config.algo.name}"
-        folder = shlex.quote(nearby(run.root))
-        return f"continue: gmijax train {job} run.dir={folder} run.resume=auto"
-    if not read_metrics(run.metrics):
-        return "there is no checkpoint"
-    return (
-        "no checkpoint was saved: GMIs have run.stop_timeout_s for that, after Ctrl-C "
-        "run.stall_timeout_s"
-    )
+        command = f"gmijax train {job} run.dir={shlex.quote(folder)} run.resume=auto"
+        if status is None:
+            return f"to continue from the last checkpoint: {command}"
+        return f"the run is saved. To continue: {command}"
+    if is_needless(config, run):
+        return "no run folder is left"
+    return f"no checkpoint was saved; the run folder stays: {folder}"

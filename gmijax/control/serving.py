@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 
@@ -38,14 +38,16 @@ from gmijax.runs.folder import (
     require_new_run,
     write_json,
 )
-from gmijax.runs.held import OpenFolder, gone_if_refused, locked
-from gmijax.runs.history import MetricsReader
-from gmijax.runs.resume import CheckpointMeta, find_checkpoint
+from gmijax.runs.held import OpenFolder, gone_if_unused, locked
+from gmijax.runs.history import MetricsReader, read_metrics
+from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, find_checkpoint, is_training
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import serving_kind
 from gmijax.supervise.run_gmis import Launch, recorded, run_gmis
 from gmijax.supervise.watched_gmi import GmiStatus
+
+_NOTHING_WRITTEN: Final = "nothing was written; to keep the experience, set output.dir=DIR"
 
 
 class Served(NamedTuple):
@@ -110,7 +112,7 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
             folders.append(held.enter_context(locked(data.lock, f"output.dir={data.root}")))
             if is_new:
                 no_shard = partial(_has_no_shard, data)
-                held.enter_context(gone_if_refused(data.root, no_shard))
+                held.enter_context(gone_if_unused(data.root, no_shard))
         kept = job.finished_unrolls()
         if kept and kept == job.wanted_unrolls:
             raise ConfigError(
@@ -119,7 +121,7 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
             )
         env = job.config.env
         run = create_run(None, job.config.run.name, f"{env.slug}-serve")
-        held.enter_context(gone_if_refused(run.root))
+        held.enter_context(gone_if_unused(run.root, partial(_has_collected_nothing, job, run)))
         folders.append(held.enter_context(OpenFolder(run.root, f"run.dir={run.root}")))
         write_json(run.config, to_dict(job.config))
         write_json(run.plan, job.plan.to_dict())
@@ -141,6 +143,10 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
     return Served(run.root, summary, None if job.data is None else job.data.root)
 
 
+def _has_collected_nothing(job: _ServingJob, run: RunPaths) -> bool:
+    return not any(read_metrics(run.gmi(gmi).metrics) for gmi in job.simulators)
+
+
 def _has_no_shard(data: DataPaths) -> bool:
     return next(data.finished(), None) is None
 
@@ -151,6 +157,9 @@ def _prepared(config: ServeConfig, console: Console) -> _ServingJob:
     require_new_run(None, config.run.name)  # Before a search, which takes minutes.
     if config.run.dir is not None and (notice := source.executed(config.env)):
         console.print(notice)
+    newer = ()
+    if config.run.dir == "last":
+        _, newer = choose_checkpoint(config.run.dir, "run.dir")
     config, plan, machine, reasons = decide(_with_checkpoint(config), console)
     data = None
     if config.output.dir is not None:
@@ -161,7 +170,7 @@ def _prepared(config: ServeConfig, console: Console) -> _ServingJob:
     assert group is not None
     if config.run.dir is not None and (unknown := left_out(Path(config.run.dir))):
         reasons = (*reasons, unknown)
-    return _ServingJob(config, plan, machine, group.gmis, data, reasons)
+    return _ServingJob(config, plan, machine, group.gmis, data, (*reasons, *newer))
 
 
 def _with_checkpoint(config: ServeConfig) -> ServeConfig:
@@ -308,7 +317,7 @@ def _output(job: _ServingJob, kept: int) -> dict[str, Any] | None:
 
 def _what_is_left(job: _ServingJob) -> str:
     if job.data is None:
-        return "no output was asked for"
+        return _NOTHING_WRITTEN
     done = job.finished_unrolls()
     return (
         f"{done} of {job.wanted_unrolls} shards are in {job.data.root}; "
@@ -324,7 +333,11 @@ def _announce(console: Console, job: _ServingJob, kept: int, run: RunPaths) -> N
     )
     announce(console, run, plan, what, job.reasons)
     if job.config.run.dir is not None:
-        console.print(f"policy: {nearby(Path(job.config.run.dir))}")
+        checkpoint = Path(job.config.run.dir)
+        still = ", of a run that still trains" if is_training(checkpoint.parents[1]) else ""
+        console.print(f"policy: {nearby(checkpoint)}{still}")
+    if job.data is None:
+        console.print("output.dir is not set: rates are measured, and no experience is written")
     if kept and job.data is not None:
         console.print(
             f"continuing {nearby(job.data.root)}: {kept} of {job.wanted_unrolls} shards are there",

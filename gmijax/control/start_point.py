@@ -12,10 +12,12 @@ from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import (
+    NO_RUN_FOLDER,
     RUNS,
     RunPaths,
     create_run,
     given_run,
+    is_anothers,
     read_json,
     replays_of,
     require_new_run,
@@ -69,7 +71,7 @@ def find_start_point(config: TrainConfig) -> StartPoint:
         return _go_on_or_start(config)
     if config.run.resume is None and (run := _untrained(config)) is not None:
         return StartPoint(run, notes=(f"nothing was trained in {nearby(run.root)} before",))
-    require_new_run(config.run.dir, config.run.name, "; run.resume=auto continues that run")
+    require_new_run(config.run.dir, config.run.name, "; run.resume=auto continues in it")
     if config.run.resume is None:
         return StartPoint()
     checkpoint, notes = choose_checkpoint(config.run.resume, "run.resume")
@@ -108,9 +110,9 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
             raise ConfigError(f"{shown} is not a folder")
         return StartPoint()
     run = RunPaths(folder.resolve())
+    if is_anothers(run.root):
+        raise ConfigError(f"{shown} {NO_RUN_FOLDER}")
     if not run.config.exists():
-        if any(path != run.lock for path in folder.iterdir()):
-            raise ConfigError(f"{shown} is neither a run folder nor empty")
         return StartPoint(run)
     # The folder of a checkpoint that may not be there yet.
     saved = saved_config(run.checkpoint(0))

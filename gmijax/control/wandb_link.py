@@ -27,7 +27,7 @@ def require_wandb(config: TrainConfig) -> None:
     if mode != "off" and versions_of(["wandb"])["wandb"] is None:
         raise ConfigError(
             f"wandb.mode={mode}: needs the package wandb (pip install 'gmijax[wandb]'); "
-            "allowed without it is off"
+            "without it, use wandb.mode=off"
         )
 
 

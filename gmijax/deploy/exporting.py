@@ -69,7 +69,7 @@ def require_packages(config: ExportConfig) -> None:
     if importlib.util.find_spec("jax2onnx") is None:
         raise ConfigError(
             f"format={config.format}: needs the package jax2onnx (pip install 'gmijax[export]'); "
-            "allowed without it is stablehlo"
+            "without it, use format=stablehlo"
         )
 
 

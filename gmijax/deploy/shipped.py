@@ -13,7 +13,7 @@ from gmijax.config.schema import to_dict
 from gmijax.deploy.pictures import run_child
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.opengl import NO_OPENGL, environment_with
-from gmijax.player.shipped import require_shipped
+from gmijax.player.shipped import require_alone, require_shipped
 from gmijax.runs.folder import RUNS, PlayPaths, RunPaths, remove_temporary, write_json
 from gmijax.supervise.failures import last_line
 
@@ -27,17 +27,12 @@ def checked(config: PlayConfig) -> PlayConfig:
     Raises:
       ConfigError: no policy of this task is shipped, or it cannot be played so.
     """
+    require_alone("run.dir", config.run.dir)  # Who names a run has no task to name.
     require_shipped(config.run.env)
-    for key, value, allowed in (
-        ("run.dir", config.run.dir, None),
-        ("deterministic", config.deterministic, True),
-        ("randomize", config.randomize, "off"),
-        ("physics.impl", config.physics.impl, "auto"),
-        ("walking_envs", config.walking_envs or None, None),
-    ):
-        if value != allowed:
-            shown = "null" if allowed is None else str(allowed).lower()
-            raise ConfigError(f"{key}={value}: allowed with checkpoint=shipped is {shown}")
+    require_alone("deterministic", config.deterministic, True)
+    require_alone("randomize", config.randomize, "off")
+    require_alone("physics.impl", config.physics.impl, "auto")
+    require_alone("walking_envs", config.walking_envs or None)
     return config
 
 

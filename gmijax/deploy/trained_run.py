@@ -14,18 +14,18 @@ from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import META, RunPaths, remove_temporary, write_json
 from gmijax.runs.names import steps_name
+from gmijax.runs.ranking import best_checkpoint, ranked
 from gmijax.runs.resume import (
     CheckpointMeta,
-    best_checkpoint,
     checkpoints_of,
     find_checkpoint,
     first_checkpoint_of,
-    rank_of,
+    newer_than,
     unsaved_runs,
 )
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
-from gmijax.sim.registry import require_env
+from gmijax.sim.registry import require_env, require_own
 
 C = TypeVar("C", PlayConfig, ExportConfig, ViewConfig)
 
@@ -47,17 +47,21 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
       ConfigError: no such run or checkpoint, or its task cannot be had.
     """
     if config.run.env is not None and ".py" not in config.run.env:
-        hint = f"; add checkpoint={SHIPPED} for the policy that comes with gmijax"
-        why = "a run knows its task" + ("" if isinstance(config, ExportConfig) else hint)
+        hint = f"; to play the policy that comes with gmijax, add checkpoint={SHIPPED}"
+        why = "not needed, a run knows its task" + (
+            "" if isinstance(config, ExportConfig) else hint
+        )
         raise ConfigError(f"env={config.run.env}: {why}")
     checkpoint = checkpoint_of(config)
     early = None
     is_last = config.checkpoint in (None, "best") and config.run.dir in (None, "last")
-    if config.checkpoint == "best" and not rank_of(checkpoint).is_full:
+    if config.checkpoint == "best" and not ranked([checkpoint])[0][0].is_full:
         early = (
             "checkpoint=best: none has an evaluation or a full window of episodes to compare by"
         )
     saved, _ = trained_config(checkpoint)
+    if isinstance(config, ViewConfig):  # Before its file is asked for: it is not executed.
+        require_own(saved)
     env = source.opened(saved, config.run.env)
     require_env(env)
     run = dataclasses.replace(config.run, dir=str(checkpoint.parents[1]))
@@ -70,6 +74,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
         left_out(checkpoint),
         early,
         *(f"{run}: {first_checkpoint_of(run)}" for run in (unsaved_runs() if is_last else ())),
+        *(newer_than(checkpoint) if is_last else ()),
     )
     return config, env, "\n".join(filter(None, notes)) or None
 

@@ -21,7 +21,7 @@ from gmijax.deploy.trained_run import open_run
 from gmijax.errors import ConfigError, NoCheckpointYet
 from gmijax.player.plain_env import PlainEnv, task_of
 from gmijax.player.policy import PlainPolicy, checkpoint_policy
-from gmijax.player.shipped import require_shipped, shipped_policy
+from gmijax.player.shipped import require_alone, require_shipped, shipped_policy
 from gmijax.viewer.checkpoints import Checkpoints
 from gmijax.viewer.guard import Guard, is_loopback
 from gmijax.viewer.installed import INSTALL, missing
@@ -60,9 +60,8 @@ class _Shown(NamedTuple):
 
 def _shipped(config: ViewConfig) -> _Shown:
     """The policy that comes with gmijax."""
-    task, run_dir = require_shipped(config.run.env), config.run.dir
-    if run_dir is not None:
-        raise ConfigError(f"run.dir={run_dir}: allowed with checkpoint=shipped is null")
+    require_alone("run.dir", config.run.dir)
+    task = require_shipped(config.run.env)
     policy = shipped_policy(task)
     lines = (f"the policy of {task} that comes with gmijax",)
     return _Shown(task_of(policy), policy, None, False, lines)

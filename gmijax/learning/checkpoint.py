@@ -59,6 +59,7 @@ def checkpoint_meta(
         impl=config.physics.impl,
         mean_return=standing.mean_return,
         window_full=standing.is_full,
+        limit_steps=standing.limit_steps,
         eval_return=eval_return,
         learning_rate=algo.learning_rate,
     )
@@ -142,7 +143,7 @@ def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = 
     Args:
       paths: the run folder.
       meta: what the checkpoint holds; the list of its files is added.
-      keep: how many checkpoints stay, among them always the best one (see `rank_of`) and the
+      keep: how many checkpoints stay, among them always the best one (see `ranked`) and the
         last one; None: all.
     """
     final, partial = paths.checkpoint(meta.env_steps), paths.unfinished(meta.env_steps)

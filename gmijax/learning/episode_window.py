@@ -30,10 +30,13 @@ class Standing(NamedTuple):
     Attributes:
       mean_return: over the long window, None while no episode has ended.
       is_full: whether that window is full.
+      limit_steps: a time limit of all environments together, in environment steps, None where it
+        is not known.
     """
 
     mean_return: float | None = None
     is_full: bool = False
+    limit_steps: float | None = None
 
 
 class EpisodeWindow:
@@ -96,7 +99,7 @@ class EpisodeWindow:
         is_long = self._steps >= self._began + 2 * self._limit
         is_settled = bool(self._ended) and self._ended[0].at > self._began + self._limit
         is_full = self._count >= WINDOW_EPISODES and is_long and is_settled
-        return Standing(_means(self._ended, ())["return"], is_full)
+        return Standing(_means(self._ended, ())["return"], is_full, self._limit or None)
 
     def state(self) -> dict[str, Any]:
         """All of it, for a JSON file of a checkpoint."""

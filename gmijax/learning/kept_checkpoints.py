@@ -8,14 +8,15 @@ import shutil
 from pathlib import Path
 
 from gmijax.runs.folder import META, RunPaths, replays_of, write_json
-from gmijax.runs.resume import CheckpointMeta, checkpoints_of, rank_of
+from gmijax.runs.ranking import ranked
+from gmijax.runs.resume import CheckpointMeta, checkpoints_of
 
 
 def keep_best(paths: RunPaths, keep: int, last: Path) -> None:
-    """Leaves so many checkpoints up to `last`: that, the best one (`rank_of`), the newest ones."""
+    """Leaves so many checkpoints up to `last`: that, the best one (`ranked`), the newest ones."""
     # Later ones, which a restart has passed over, are in nobody's place.
     found = [path for path in checkpoints_of(paths.root) if path.name <= last.name]
-    best = max(reversed(found), key=rank_of)
+    best = ranked(found)[0][1]
     others = [path for path in found if path != best]
     num_others = max(keep - 1, int(best != last))
     for path in others[: max(0, len(others) - num_others)]:

@@ -30,8 +30,8 @@ from gmijax.learning.report_thread import ReportThread
 from gmijax.learning.start import first_envs, first_state
 from gmijax.learning.throughput import ThroughputMeter
 from gmijax.runs.folder import RunPaths, write_json
+from gmijax.runs.ranking import best_evaluation
 from gmijax.runs.result import TrainResult
-from gmijax.runs.resume import best_evaluation
 from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.supervise.child import ChildLink
 from gmijax.types import PyTree

@@ -21,7 +21,7 @@ from gmijax.sim.c_physics import CPhysics
 from gmijax.sim.divergence import diverged_by_source, end_diverged
 from gmijax.sim.interaction import action_repeat, observation_history, time_limit
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.registry import TASKS, require_env
+from gmijax.sim.registry import TASKS, require_env, require_own
 from gmijax.sim.simulators import C
 from gmijax.sim.tasks.settings import SETTINGS, settings_from
 
@@ -185,12 +185,7 @@ def task_of(policy: PlainPolicy) -> EnvConfig:
 
 
 def _plain_task(config: EnvConfig) -> Env:
-    if config.suite != "gmijax":
-        allowed = ", ".join(TASKS)
-        raise ConfigError(
-            f"env={config.label}: only our own tasks are played without jax: {allowed}; "
-            "gmijax play films others"
-        )
+    require_own(config)
     require_env(config)
     module = importlib.import_module(TASKS[str(config.name)])
     env: Env = module.make(impl=C, rewards=config.rewards, settings=config.settings)

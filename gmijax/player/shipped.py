@@ -16,6 +16,15 @@ def shipped_tasks() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in POLICIES.glob("*.npz")))
 
 
+def require_alone(key: str, value: object, allowed: object = None) -> None:
+    """Raises ConfigError for a key that a shipped policy cannot be played with."""
+    if value != allowed:
+        shown = str(value).lower() if isinstance(value, bool) else value
+        raise ConfigError(
+            f"checkpoint=shipped cannot be combined with {key}; remove {key}={shown}"
+        )
+
+
 def require_shipped(task: str | None) -> str:
     """The task; raises ConfigError if no policy of it is shipped."""
     tasks = ", ".join(shipped_tasks()) or "none (python -m benchmarks.shipped makes them)"

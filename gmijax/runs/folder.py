@@ -33,6 +33,8 @@ UNFINISHED, REMOVED = ".partial", ".removed"
 EXIT_NO_GL = 3
 """Exit code of the renderer where the OpenGL that it was told to use cannot be had."""
 
+NO_RUN_FOLDER: Final = "is not a run folder, and is not empty"
+
 _TEMPORARY = re.compile(r"\..+\.\d+-\d+")
 """Names that files have while they are written."""
 
@@ -204,13 +206,24 @@ def given_run(run_dir: str | None, name: str | None) -> Path | None:
 def require_new_run(run_dir: str | None, name: str | None, hint: str = "") -> None:
     """Raises ConfigError if the run folder that the user names exists already.
 
-    `hint` is added where it is a folder.
+    `hint` is added where a run can go on or begin in it.
     """
     root = given_run(run_dir, name)
-    if root is not None and os.path.lexists(root):
-        key = "run.dir" if run_dir else "run.name"
-        what = f"the run folder exists already{hint}" if root.is_dir() else "not a folder"
-        raise ConfigError(f"{key}={root}: {what}")
+    if root is None or not os.path.lexists(root):
+        return
+    what = f"the run folder exists already{hint}"
+    if not root.is_dir():
+        what = "not a folder"
+    elif is_anothers(root):
+        what = NO_RUN_FOLDER
+    key = "run.dir" if run_dir else "run.name"
+    raise ConfigError(f"{key}={root}: {what}")
+
+
+def is_anothers(folder: Path) -> bool:
+    """Whether a folder has something in it that is no run."""
+    run = RunPaths(folder)
+    return not run.config.exists() and any(path != run.lock for path in folder.iterdir())
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:

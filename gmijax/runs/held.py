@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from gmijax.errors import BackendUnavailable, ConfigError, FolderLost
+from gmijax.errors import BackendUnavailable, ConfigError, FolderLost, JobInterrupted
 
 _GONE: Final = (errno.ENOENT, errno.ENOTDIR, errno.ESTALE)
 """Errors of a path that leads nowhere; others, of a network for one, say nothing."""
@@ -86,14 +86,14 @@ def locked(lock: Path, what: str) -> Iterator[OpenFolder]:
 
 
 @contextmanager
-def gone_if_refused(root: Path, is_empty: Callable[[], bool] = lambda: True) -> Iterator[None]:
-    """Removes a folder that a job made, if its input is refused while nothing came of it yet.
+def gone_if_unused(root: Path, is_empty: Callable[[], bool] = lambda: True) -> Iterator[None]:
+    """Removes a folder that a job made, if it is refused or interrupted before it holds anything.
 
     A backend that cannot be had is no such input: its logs, which the error names, stay.
     """
     try:
         yield
-    except ConfigError as error:
+    except (ConfigError, JobInterrupted) as error:
         if not isinstance(error, BackendUnavailable) and is_empty():
             shutil.rmtree(root, ignore_errors=True)
         raise

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
-import math
 import os
 import shutil
 import zlib
@@ -27,7 +26,7 @@ from gmijax.runs.folder import (
     read_json,
 )
 from gmijax.runs.held import is_locked
-from gmijax.runs.names import by_steps, steps_name, steps_of
+from gmijax.runs.names import by_steps, nearby, steps_name, steps_of
 
 _CHUNK_BYTES: Final = 1 << 20
 
@@ -56,6 +55,8 @@ class CheckpointMeta:
     eval_return: float | None = None
     # Whether `mean_return` is over enough episodes; not known of older versions.
     window_full: bool = False
+    # A time limit of all its environments together, in environment steps; None: not known.
+    limit_steps: float | None = None
     # As the run was told, that of the schedule is in the learner's state.
     learning_rate: float | None = None
     # When it was written, seconds since 1970: files get new times when a run is copied.
@@ -126,46 +127,6 @@ def newest_checkpoint(folder: Path) -> NewestCheckpoint:
     return NewestCheckpoint(None, tuple(passed_over))
 
 
-def best_checkpoint(folder: Path) -> Path | None:
-    """The best checkpoint of a run folder, by `rank_of`, whose files are as they were written."""
-    ranked = sorted(reversed(checkpoints_of(folder)), key=rank_of, reverse=True)
-    return next((path.resolve() for path in ranked if what_is_broken(path) is None), None)
-
-
-def best_evaluation(folder: Path, env_steps: int) -> float:
-    """The best mean return of the evaluations of a run folder up to `env_steps`, -inf for none.
-
-    Of those that have a checkpoint, and the best one always has.
-    """
-    found = (rank_of(path) for path in checkpoints_of(folder) if int(path.name) <= env_steps)
-    return max((rank.value for rank in found if rank.is_evaluated), default=-math.inf)
-
-
-class Rank(NamedTuple):
-    """What checkpoints are ranked by; the best one has the largest.
-
-    One without an evaluation comes after all that have one. Its mean return in training counts
-    after all those of full windows where its own window is not: at the start of a run it is of
-    short episodes alone.
-    """
-
-    is_evaluated: bool
-    is_full: bool
-    value: float
-
-
-def rank_of(checkpoint: Path) -> Rank:
-    """The rank of a checkpoint."""
-    try:
-        meta = CheckpointMeta.read(checkpoint)
-    except ConfigError:
-        return Rank(False, False, -math.inf)
-    if meta.eval_return is not None:
-        return Rank(True, True, meta.eval_return)
-    mean = -math.inf if meta.mean_return is None else meta.mean_return
-    return Rank(False, meta.window_full, mean)
-
-
 def what_is_broken(checkpoint: Path) -> str | None:
     """Why a checkpoint cannot be used, None if its files are as they were written."""
     try:
@@ -222,6 +183,9 @@ def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
             raise ConfigError(f"{key}={wanted}: {wrong}")
         return folder.resolve(), ()
     found = newest_checkpoint(folder)
+    if wanted == "last" and found.checkpoint is not None:
+        newer = newer_than(found.checkpoint)
+        return found.checkpoint, (*found.passed_over, *newer)
     if found.checkpoint is None:
         if not found.passed_over and is_training(folder):
             raise NoCheckpointYet(f"{key}={wanted}: {first_checkpoint_of(folder)}")
@@ -292,6 +256,40 @@ def last_run(key: str) -> Path:
 def unsaved_runs() -> list[Path]:
     """The run folders below `RUNS` that are being trained and have no checkpoint yet."""
     return [run for run in _folders_in(RUNS) if is_training(run) and not checkpoints_of(run)]
+
+
+def newer_than(checkpoint: Path) -> tuple[str, ...]:
+    """What `last` has passed over below `RUNS` for a checkpoint, in a line; empty: nothing newer.
+
+    Runs without a checkpoint that have ended, and sweeps, in whose folders the runs are.
+    """
+    since_s, named = _written_s(checkpoint)[0], list[str]()
+    for folder in _folders_in(RUNS):
+        jobs = [path for job in _folders_in(folder) for path in checkpoints_of(job)[-1:]]
+        if jobs and max(_written_s(path)[0] for path in jobs) > since_s:
+            newest = max(jobs, key=_written_s).parents[1]
+            named.append(f"{folder} (a sweep; its newest run: {newest})")
+        elif _is_unsaved_training(folder) and _begun_s(folder) > since_s:
+            named.append(f"{folder} (no checkpoint)")
+    if not named:
+        return ()
+    more = f", and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
+    run = nearby(checkpoint.parents[1])
+    return (f"last is {run}; newer, but passed over: {', '.join(named[:_MOST_NAMED])}{more}",)
+
+
+def _is_unsaved_training(folder: Path) -> bool:
+    """Whether a training run has ended in a folder without a checkpoint."""
+    paths = RunPaths(folder)
+    if not paths.plan.exists() or checkpoints_of(folder) or is_training(folder):
+        return False
+    with suppress(ConfigError):
+        return "algo" in read_json(paths.config)  # Not so of `gmijax serve`.
+    return False
+
+
+def _begun_s(folder: Path) -> float:
+    return os.lstat(RunPaths(folder).config).st_mtime
 
 
 def is_training(folder: Path) -> bool:

@@ -80,7 +80,7 @@ def choose_impl(
         if not warp_installed:
             raise ConfigError(
                 "physics.impl=warp: needs the package warp-lang (pip install 'gmijax[warp]'); "
-                "allowed without it are auto, jax"
+                "without it, use physics.impl=auto"
             )
         return "warp", _GIVEN
     if not is_gpu:

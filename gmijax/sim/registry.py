@@ -69,6 +69,15 @@ def require_task(name: str, suite: str = "gmijax") -> None:
         raise ConfigError(f"env={name}: unknown task; allowed: {', '.join(task_names())}")
 
 
+def require_own(env: EnvConfig) -> None:
+    """Raises ConfigError unless it is one of our tasks: they alone run without jax."""
+    if env.suite != "gmijax":
+        raise ConfigError(
+            f"env={env.label}: only our own tasks are played without jax: {', '.join(TASKS)}; "
+            "gmijax play films others"
+        )
+
+
 def missing_of(choice: str) -> str | None:
     """What a value of `env=` needs that is not on this machine, in words; None: nothing."""
     try:

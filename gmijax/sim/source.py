@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
+import shlex
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -69,9 +70,11 @@ def pinned(env: EnvConfig) -> EnvConfig:
         raise ConfigError(f"env={path}: cannot be read ({error.strerror})") from None
     if env.source_sha256 not in (None, digest):
         # To open a run is not to say that whatever its file holds by now may be executed.
+        how = "has changed" if env.source_sha256 else "may have changed"
+        key = shlex.quote(f"env={path}:{function}")
         raise ConfigError(
-            f"env={path}:{function}: not the file that the run noted (its SHA-256 differs), so it "
-            f"is not executed; env={path}:{function} says that it is meant as it is now"
+            f"{path} {how} since this run was trained, so it was not executed. To use the file as "
+            f"it is now, add {key}"
         )
     return dataclasses.replace(env, name=f"{path}:{function}", source_sha256=digest)
 

@@ -24,11 +24,13 @@ class StopSignals:
 
     Attributes:
       requests: how many have come that count: the first asks to save and end, the second to end.
+      name: what the last request that counted is called: `Ctrl-C`, or a signal's name.
       are_urgent: whether one of them was not Ctrl-C: whoever has sent it may soon kill the job.
     """
 
     def __init__(self) -> None:
         self.requests = 0
+        self.name = ""
         self.are_urgent = False
         self._last_s: dict[int, float] = {}
 
@@ -43,6 +45,7 @@ class StopSignals:
         is_again = now_s - self._last_s.get(number, now_s) >= _AGAIN_S
         if is_again or not self._last_s:
             self.requests += 1
+            self.name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
         self.are_urgent |= number != signal.SIGINT
         self._last_s[number] = now_s
 

@@ -77,7 +77,9 @@ class Supervisor:
             return GmiStatus(gmi, "starting", 0, None, None)
         status = self._started[gmi].status()
         is_stopping = self._is_stopping and status.state == "running"
-        return status._replace(state="stopping") if is_stopping else status
+        if not is_stopping:
+            return status
+        return status._replace(state="stopping", stopped_by=self._signals.name)
 
     def run(self, on_tick: Callable[[tuple[GmiStatus, ...]], None] | None = None) -> None:
         """Runs the job to its end; calls `on_tick` about 20 times a second.
@@ -111,7 +113,7 @@ class Supervisor:
             raise
         self._end_all()
         if self._signals.have_come:
-            raise JobInterrupted("stopped; all processes have finished their work")
+            raise JobInterrupted("stopped")
 
     def _alive(self) -> list[WatchedGmi]:
         return [process for process in self._started.values() if process.exit_code is None]
@@ -168,10 +170,10 @@ class Supervisor:
             return
         if self._signals.requests > 1:
             raise JobInterrupted(
-                "stopped at once by a second signal; unfinished work is not saved"
+                f"stopped at once by a second {self._signals.name}; what was not saved yet is lost"
             )
         if not all(p.is_ready for p in self._started.values()):
-            raise JobInterrupted("stopped before training began")
+            raise JobInterrupted("stopped before the work began")
         if not self._is_stopping:
             self._is_stopping = True
             self.ask_to_finish()
@@ -186,9 +188,11 @@ class Supervisor:
             self._stop_deadline_s = now_s + self._launch.timeouts.stop_timeout_s
         elif now_s > self._stop_deadline_s:
             late = [process.gmi for process in self._alive()]
+            limit = f"{self._launch.timeouts.stop_timeout_s:g} s"
+            if self._launch.waits_after_ctrl_c:
+                limit += " (run.stop_timeout_s)"
             raise JobInterrupted(
-                f"stopped; GMIs {late} did not finish within "
-                f"{self._launch.timeouts.stop_timeout_s:g} s and were ended"
+                f"stopped; GMIs {late} did not finish within {limit} and were ended"
             )
 
     def _verify_shares(self) -> None:

@@ -20,6 +20,7 @@ class GmiStatus(NamedTuple):
       iteration: training iterations done.
       pid: its process, None before the start.
       exit_code: None while it runs; negative for the signal that ended it.
+      stopped_by: what has asked the job to end, see `StopSignals.name`; empty: nothing.
     """
 
     gmi: int
@@ -27,6 +28,7 @@ class GmiStatus(NamedTuple):
     iteration: int
     pid: int | None
     exit_code: int | None
+    stopped_by: str = ""
 
 
 class WatchedGmi(ABC):

@@ -19,7 +19,10 @@ _QUARTILES = (25, 75)
 
 
 class SeedSummary(NamedTuple):
-    """Interquartile mean over seeds, and the quartiles (as rliable has it, arXiv 2108.13264)."""
+    """Interquartile mean over seeds, and the quartiles (as rliable has it, arXiv 2108.13264).
+
+    Of two seeds it is their mean, of three their median.
+    """
 
     mean: Values
     low: Values
@@ -30,9 +33,14 @@ def seed_summary(values: Values) -> SeedSummary:
     """Of values [K, ...] of K seeds."""
     low, high = np.percentile(values, _QUARTILES, axis=0)
     inside = (values >= low) & (values <= high)
-    # With two or three seeds the quartiles lie between them, and nothing else does.
+    # Those of two seeds lie between them, and nothing else does.
     inside |= ~inside.any(axis=0)
     return SeedSummary((values * inside).sum(axis=0) / inside.sum(axis=0), low, high)
+
+
+def name_of_middle(num_seeds: int) -> str:
+    """What `seed_summary` takes of so many seeds."""
+    return {1: "one seed", 2: "mean", 3: "median"}.get(num_seeds, "interquartile mean")
 
 
 def without_seed(overrides: Mapping[str, str]) -> dict[str, str]:

@@ -45,7 +45,7 @@ def _found(folder: Path, work: Work[J]) -> Path:
         raise ConfigError(f"run.dir={folder}: is not a folder")
     paths = work.paths(folder.resolve())
     if not paths.request.exists() and any(path != paths.lock for path in folder.iterdir()):
-        raise ConfigError(f"run.dir={folder}: is neither a folder of a {work.name} nor empty")
+        raise ConfigError(f"run.dir={folder}: is not a {work.name} folder, and is not empty")
     return paths.root
 
 

@@ -20,7 +20,15 @@ from gmijax.control.display import clock
 from gmijax.runs.folder import write_bytes, write_json, write_text
 from gmijax.runs.held import OpenFolder
 from gmijax.sweeps.any_job import AnyJob, label_of, trainings_per_hour
-from gmijax.sweeps.by_setting import Row, SeedSummary, grouped, place_of, seed_summary, settings_of
+from gmijax.sweeps.by_setting import (
+    Row,
+    SeedSummary,
+    grouped,
+    name_of_middle,
+    place_of,
+    seed_summary,
+    settings_of,
+)
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.progress import State
 from gmijax.version import __version__
@@ -168,7 +176,8 @@ def tables(report: Mapping[str, Any], ranking: Ranking) -> list[Table]:
 
 
 def _setting_table(settings: Sequence[Row], ranking: Ranking) -> Table:
-    mean = f"{ranking.objective}, interquartile mean"
+    num_seeds = max(setting["n"] for setting in settings)
+    heading = f"{ranking.objective}, {name_of_middle(num_seeds)}"
     rows: list[Sequence[str]] = []
     for rank, setting in enumerate(settings, 1):
         label, of = label_of(setting["overrides"]) or "all seeds", len(setting["jobs"])
@@ -180,7 +189,7 @@ def _setting_table(settings: Sequence[Row], ranking: Ranking) -> Table:
         note = "" if setting["window_full"] else " (too few episodes to compare)"
         middle = f"{setting['interquartile_mean']:.4g}{note}"
         rows.append((str(rank), label, middle, f"{low:.4g} to {high:.4g}", n))
-    return _table(("rank", "setting", mean, "quartiles", "n"), rows)
+    return _table(("rank", "setting", heading, "quartiles", "n"), rows)
 
 
 def _job_table(jobs: Sequence[Row], ranking: Ranking) -> Table:

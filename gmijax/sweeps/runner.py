@@ -102,7 +102,7 @@ def _run(
         if (wrong := report.end(status)) is not None:
             error.add_note(wrong)
         job_events.end(report.data)
-        _say_how_to_continue(error, jobs, paths)
+        _say_how_to_continue(error, work, jobs, paths)
         raise
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
@@ -114,12 +114,18 @@ def _run(
     return SweepResult(paths.root, report.data)
 
 
-def _say_how_to_continue(error: BaseException, jobs: Sequence[J], paths: SweepPaths) -> None:
-    folder = shlex.quote(nearby(paths.root))
+def _say_how_to_continue(
+    error: BaseException, work: Work[J], jobs: Sequence[J], paths: SweepPaths
+) -> None:
+    folder = shlex.quote(f"run.dir={nearby(paths.root)}")
     if isinstance(error, JobInterrupted | SweepFailed):
-        error.add_note(f"continue: the same command with run.dir={folder}")
+        # The folder first: what follows `--` is the program's.
+        command = f"the same command with {folder}"
+        if work.words:
+            command = f"gmijax {work.name} {folder} {shlex.join(work.words)}"
+        error.add_note(f"to continue: {command}")
     elif isinstance(error, ConfigError) and any(job.progress.attempts for job in jobs):
-        error.add_note(f"continue: the command with that mended and run.dir={folder}")
+        error.add_note(f"to continue: the command with that mended and {folder}")
 
 
 def _require_success(
@@ -168,7 +174,7 @@ def _run_jobs(
             if not hinted and (hint := work.hint(report.data)):
                 hinted.append(hint)  # At the end it is said once more.
                 console.print(hint)
-            view.update(is_stopping=signals.have_come)
+            view.update(signals.name)
             job_events.update()
 
         Scheduler(

@@ -35,7 +35,7 @@ from gmijax.sweeps.training import TrainingKind
 from gmijax.sweeps.work import Folder, Work
 
 _COMPILES: Final = (
-    "the first job of each task and size compiles its programs, usually 1 to 3 minutes; the rest "
+    "the first job of each task and size compiles its programs, up to 3 minutes; the rest "
     "load them"
 )
 

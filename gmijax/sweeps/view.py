@@ -21,9 +21,7 @@ _HEADINGS = (
     *("job", "overrides", "GPU and slot", "progress", "steps/s", "{}", "ranked by", "ETA"),
     "state",
 )
-_STOPPING = (
-    "stopping: running jobs save and end; a second Ctrl-C ends them at once, without saving"
-)
+_STOPPING = "stopping: running jobs save and end; a second {} ends them at once, without saving"
 _MOST_ROWS = 30
 _BAR_WIDTH = 6
 _ORDER = ("running", "failed", "interrupted", "waiting", "pruned", "completed")
@@ -53,11 +51,11 @@ class SweepView:
         self._display.__exit__(*exc)
         self._display.show(self._print_changes)
 
-    def update(self, *, is_stopping: bool = False) -> None:
-        """Called about ten times a second; `is_stopping`: a signal has asked for an end."""
-        if is_stopping and not self._is_stopping:
+    def update(self, stopped_by: str = "") -> None:
+        """Called about ten times a second; `stopped_by`: as of `GmiStatus`."""
+        if stopped_by and not self._is_stopping:
             self._is_stopping = True
-            self._console.print(_STOPPING)
+            self._console.print(_STOPPING.format(stopped_by))
         self._display.show(self._show)
 
     def line(self) -> str:
@@ -98,6 +96,8 @@ class SweepView:
         value = ""
         if progress.value is not None:
             found = shown(progress.value, progress.is_full, progress.episodes)
+            if progress.state == "interrupted":  # It is not compared with others yet.
+                found = f"{progress.value:.4g} so far"
             value = f", {self._ranking.objective} {found}"
         return f"{what} after {progress.wall_s:.0f} s{value}; {self.line()}"
 

@@ -37,6 +37,8 @@ def announce(
     at_once = f"at most {slots}" if work.is_adaptive and sites[0].machine.gpus else str(slots)
     console.print(f"{_counted(total, 'job')}{more}, {at_once} at a time {_where(sites)}")
     print_reasons(console, [reason for site in sites for reason in site.plan.reasons])
+    if work.words and total == 1 and not work.space and settings.sampler == "grid":
+        console.print("  one job, because no key has several values; KEY=A,B makes a job of each")
     for warning in work.warnings(sites):
         console.print(f"  {warning}")
 

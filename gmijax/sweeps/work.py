@@ -42,6 +42,7 @@ class Work(ABC, Generic[J]):
       jobs: all of a grid; of another sampler some that stand for all, to be checked.
       cluster: the nodes that they run on; without an engine it is this machine.
       folder: of the command.
+      words: the command line without its folder, empty where there is none.
     """
 
     settings: JobsConfig
@@ -50,6 +51,7 @@ class Work(ABC, Generic[J]):
     jobs: tuple[J, ...]
     cluster: ClusterConfig
     folder: Folder
+    words: tuple[str, ...] = ()
 
     name: ClassVar[str]
     """Of the command, and of its report."""

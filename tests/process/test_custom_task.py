@@ -61,7 +61,7 @@ def test_a_task_of_ones_own_trains_in_two_gmis_and_resumes(tmp_path: Path):
     again = ("run.resume=last", "num_timesteps=512", "run.name=second")
     refused = run_here("train", *again, cwd=tmp_path)
     assert refused.code == 2
-    assert f"env={file}:make says that it is meant as it is now" in refused.stderr
+    assert f"To use the file as it is now, add env={file}:make" in refused.stderr
     done = train(*again, "env=point.py:make", cwd=tmp_path)
     assert f"custom task: {file}:make has changed since the run was started" in done.stdout
     # The change makes one term not a number: the error names task, step and term.

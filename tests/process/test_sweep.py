@@ -111,7 +111,7 @@ def test_a_job_whose_controller_is_killed_goes_on_from_its_checkpoint(tmp_path: 
     out = (tmp_path / "stdout.txt").read_text()
     assert "2 jobs, 2 at a time on the CPU" in out
     # Both seeds are one setting, and it comes first.
-    assert out.index("interquartile mean") < out.index("overrides")
+    assert out.index(", mean  ") < out.index("overrides")
     for name in ("sweep.json", "settings.csv", "sweep.csv", "sweep.png"):
         assert f" all/{name}" in "".join(out.split("\n")[-9:])
     assert re.search(r"\n  gmijax play run\.dir=all/00[01]\n$", out)
@@ -128,7 +128,7 @@ def test_a_misspelt_objective_ends_a_sweep_soon_and_the_mended_command_goes_on(
     (line,) = refused.stderr.splitlines()
     assert line.startswith(
         "gmijax.sweep: sweep.objective=metric/distnace: not in the metrics of these jobs: did you "
-        "mean metric/distance?; continue: the command with that mended and run.dir=all"
+        "mean metric/distance?; to continue: the command with that mended and run.dir=all"
     )
     assert report(tmp_path)["status"] == "failed"
     assert states(tmp_path) == ["interrupted", "waiting"]

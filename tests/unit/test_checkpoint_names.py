@@ -12,18 +12,18 @@ from supervision import save, save_meta
 from gmijax.cli.compose import build, compose
 from gmijax.config import PlayConfig, TrainConfig
 from gmijax.control.films import filmed
-from gmijax.control.run_folder import clear_unfinished, keep_logs, what_is_left
+from gmijax.control.run_folder import clear_unfinished, keep_logs, opened, what_is_left
+from gmijax.control.start_point import StartPoint
 from gmijax.control.summary import train_outcome
 from gmijax.deploy.trained_run import open_run
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.learning.checkpoint import finish_checkpoint
 from gmijax.runs.dataset import DataPaths
 from gmijax.runs.folder import META, RunPaths, write_json
 from gmijax.runs.names import attempt_folders, by_steps, gmi_folders, steps_name, steps_of
+from gmijax.runs.ranking import best_checkpoint, best_evaluation
 from gmijax.runs.resume import (
     CheckpointMeta,
-    best_checkpoint,
-    best_evaluation,
     checkpoints_of,
     choose_checkpoint,
     last_run,
@@ -119,13 +119,54 @@ def test_a_job_that_was_stopped_says_how_to_continue_if_it_can(
 ):
     run = RunPaths(tmp_path)
     config = build("train", TrainConfig, list(chosen))
-    # That training had not begun is said by the error already.
-    assert what_is_left(config, run) == "there is no checkpoint"
+    assert what_is_left(config, run) == "no run folder is left"
     run.metrics.write_text('{"env_steps": 64}\n')
-    assert "no checkpoint was saved: GMIs have run.stop_timeout_s" in what_is_left(config, run)
+    stays = f"no checkpoint was saved; the run folder stays: {tmp_path}"
+    assert what_is_left(config, run) == stays
     save(run, 64)
-    command = f"continue: gmijax train {words} run.dir={tmp_path} run.resume=auto"
-    assert what_is_left(config, run) == command
+    command = f"gmijax train {words} run.dir={tmp_path} run.resume=auto"
+    assert what_is_left(config, run) == f"to continue from the last checkpoint: {command}"
+    write_json(run.gmi(0).result, {"status": "stopped"})
+    assert what_is_left(config, run) == f"the run is saved. To continue: {command}"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "left", "stays"),
+    [
+        ((), None, False),
+        ((), "gmi_0/stderr.log", False),
+        ((), "gmi_0/attempt_0/stderr.log", True),  # Of a failure.
+        ((), "metrics.jsonl", True),
+        (("run.name=mine",), None, True),  # A sweep reads how it has ended.
+        (("run.dir=mine",), None, True),
+    ],
+)
+@pytest.mark.parametrize("error", [JobInterrupted("stopped"), ConfigError("refused")])
+def test_of_a_run_that_never_began_no_folder_is_left(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    overrides: tuple[str, ...],
+    left: str | None,
+    stays: bool,
+    error: GmijaxError,
+):
+    monkeypatch.chdir(tmp_path)
+    config = build("train", TrainConfig, ["env=ant", *overrides])
+    said: list[str] = []
+
+    def begin() -> None:
+        with opened(config, StartPoint()) as (run, *_):
+            write_json(run.config, {})
+            if left is not None:
+                (run.root / left).parent.mkdir(parents=True, exist_ok=True)
+                (run.root / left).write_text('{"env_steps": 64}\n')
+            said.append(what_is_left(config, run))
+            raise error
+
+    with pytest.raises(type(error)):
+        begin()
+    assert len(list(tmp_path.glob("mine"))) + len(list(tmp_path.glob("runs/*"))) == int(stays)
+    assert said[0].startswith("no checkpoint was saved; the run" if stays else "no run folder")
 
 
 def test_films_of_others_are_not_ours(run: RunPaths):

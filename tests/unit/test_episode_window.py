@@ -12,9 +12,11 @@ from gmijax.cli.compose import compose
 from gmijax.config.schema import to_dict
 from gmijax.learning.checkpoint import checkpoint_meta, finish_checkpoint, save_episodes
 from gmijax.learning.episode_window import WINDOW_EPISODES, EpisodeWindow, Standing
+from gmijax.learning.kept_checkpoints import remove
 from gmijax.learning.start import first_window
 from gmijax.runs.folder import RunPaths, write_json
-from gmijax.runs.resume import CheckpointMeta, best_checkpoint
+from gmijax.runs.ranking import best_checkpoint
+from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim.wrappers import EpisodeSums
 
 LIMIT, UNROLL = 200, 8
@@ -88,7 +90,7 @@ def test_episodes_that_run_out_of_time_alone_are_a_full_window_when_there_are_en
     assert fullness == [False] * 10 + [True] * 5
     silent = EpisodeWindow(10 * LIMIT)
     silent.add(sums(np.zeros(0)), 1e6)  # No episode has ended.
-    assert silent.standing() == Standing(None, False)
+    assert silent.standing() == Standing(None, False, 10 * LIMIT)
     assert silent.line()["window/episodes"] == 0
 
 
@@ -131,7 +133,7 @@ def test_a_window_goes_on_after_a_resume_as_if_nothing_had_been(tmp_path: Path) 
             assert resumed.line() == lines[iteration]
     # Returns with other weights are others.
     other = first_window(compose("env=ant", "env.rewards.energy=-1", resume), 1.0, 0, None)
-    assert other.standing() == Standing(None, False)
+    assert other.standing() == Standing(None, False, 1.0)
 
 
 def test_a_checkpoint_whose_window_is_not_full_is_best_only_among_its_like(tmp_path: Path) -> None:
@@ -150,3 +152,41 @@ def test_a_checkpoint_whose_window_is_not_full_is_best_only_among_its_like(tmp_p
     save(6, -6.0, False)  # Environments that began anew.
     assert best_checkpoint(run.root) == run.checkpoint(4)
     assert sorted(int(path.name) for path in run.checkpoints.iterdir()) == [4, 6]
+
+
+def test_checkpoints_are_compared_by_episodes_of_their_own_policies(tmp_path: Path) -> None:
+    """The window of a checkpoint is of episodes that began up to two time limits before it."""
+    run, config = RunPaths(tmp_path), compose("env=ant")
+    window, count = EpisodeWindow(LIMIT * 128), 128
+    # What a step earns by the policy of each time limit; the fifth is the best.
+    pays = (1.0, 2.0, 3.0, 4.0, 9.0, 1.0, 0.5)
+    lines, earned = [], np.zeros(count)
+    ages = np.arange(count) % LIMIT  # Episodes do not end in step.
+    for step in range(len(pays) * LIMIT):
+        earned, ages = earned + pays[step // LIMIT], ages + 1
+        over = ages == LIMIT
+        ended, total = int(over.sum()), float(earned[over].sum())
+        sums = EpisodeSums(float(ended), total, float(ended * LIMIT), {"time": total}, {})
+        window.add(sums, count)
+        earned[over], ages[over] = 0.0, 0
+        env_steps = (step + 1) * count
+        lines.append({"env_steps": env_steps, **window.line()})
+        if (step + 1) % LIMIT == LIMIT // 2:  # Within the time of one policy.
+            save_episodes(run, env_steps, config, window.state())
+            finish_checkpoint(run, checkpoint_meta(config, env_steps, 1, window.standing()))
+    at = {number: (number * LIMIT + LIMIT // 2) * count for number in range(len(pays))}
+    by_window = max(
+        at, key=lambda number: CheckpointMeta.read(run.checkpoint(at[number])).mean_return or 0
+    )
+    assert by_window == 5  # Its own policy is one of the worst.
+    write_lines(run, lines)
+    assert best_checkpoint(run.root) == run.checkpoint(at[4])
+    # The last has no later episodes: it is judged by what there is, and is best among equals.
+    write_lines(run, lines[: at[4] // count])
+    for number in (5, 6):
+        remove(run, run.checkpoint(at[number]))
+    assert best_checkpoint(run.root) == run.checkpoint(at[4])
+
+
+def write_lines(run: RunPaths, lines: list[dict[str, float | None]]) -> None:
+    run.metrics.write_text("".join(json.dumps(line) + "\n" for line in lines))

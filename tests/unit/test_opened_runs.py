@@ -13,11 +13,13 @@ import pytest
 from supervision import save_meta
 
 import gmijax
+from gmijax.cli.command import command
 from gmijax.cli.compose import build
-from gmijax.config import ExportConfig, PlayConfig
+from gmijax.config import ExportConfig, PlayConfig, ViewConfig
 from gmijax.config.schema import to_dict
 from gmijax.control import job, restarts, serving
 from gmijax.deploy import exporting, playing
+from gmijax.deploy.viewing import view
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta
@@ -77,8 +79,8 @@ def test_only_the_noted_file_or_one_that_is_named_is_executed(
         opened(kind)
     file = Path("point.py").resolve()
     assert str(error.value) == (
-        f"env={file}:make: not the file that the run noted (its SHA-256 differs), so it is not "
-        f"executed; env={file}:make says that it is meant as it is now"
+        f"{file} has changed since this run was trained, so it was not executed. To use the file "
+        f"as it is now, add env={file}:make"
     )
     with pytest.raises(StartedError):
         opened(kind, "env=point.py:make")
@@ -91,7 +93,7 @@ def test_only_the_noted_file_or_one_that_is_named_is_executed(
     saved = read_json(run.config)
     del saved["env"]["source_sha256"]  # Nothing is noted.
     write_json(run.config, saved)
-    with pytest.raises(ConfigError, match="is not executed"):
+    with pytest.raises(ConfigError, match="may have changed since this run was trained"):
         opened(kind)
 
 
@@ -107,6 +109,25 @@ def test_play_takes_no_other_task(run: RunPaths):
     Path("other.py").write_text(TRAP)
     with pytest.raises(ConfigError, match=r"^env=other\.py:make: the run was trained on point"):
         opened("play", "env=other.py:make")
+
+
+@pytest.mark.parametrize("overrides", [(), ("env=point.py:make",), ("checkpoint=100",)])
+def test_view_refuses_a_custom_task_before_it_looks_at_its_file(
+    run: RunPaths, overrides: tuple[str, ...]
+):
+    refusal = r"^env=point\.py:make: only our own tasks .*; gmijax play films others$"
+    for text in ("def make(): ...\n", TRAP):  # As it was, and changed.
+        Path("point.py").write_text(text)
+        with pytest.raises(ConfigError, match=refusal):
+            view(build("view", ViewConfig, ("run.dir=theirs", *overrides)))
+
+
+def test_only_commands_that_can_use_the_file_of_a_task_offer_it(
+    capsys: pytest.CaptureFixture[str],
+):
+    for name, cls, is_offered in (("view", ViewConfig, False), ("export", ExportConfig, True)):
+        command(name, cls, lambda *_, **__: None, ["--help", "all"])
+        assert ("PATH.py:FUNCTION" in capsys.readouterr().out) == is_offered
 
 
 def test_a_gmi_executes_nothing_else_either(run: RunPaths):

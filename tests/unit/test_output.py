@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from rich.text import Text
 from supervision import CHECKOUT, machine
 
 from gmijax.config import PlanConfig, ReduceConfig
+from gmijax.config.sweep import SweepConfig
 from gmijax.control import phases, progress, time_left
 from gmijax.control.console import Show, announce, doing, nearby, open_console, print_next
 from gmijax.control.display import LiveDisplay
@@ -29,7 +31,9 @@ from gmijax.partition.planner import make_plan
 from gmijax.runs.compile_times import CompileTime
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.supervise.failures import last_line
+from gmijax.supervise.stop_signals import StopSignals
 from gmijax.supervise.watched_gmi import GmiStatus
+from gmijax.sweeps.view import SweepView
 
 PRINTS = """
 from gmijax.control.console import open_console
@@ -212,8 +216,8 @@ def test_while_it_compiles_a_job_says_why_and_for_how_long(
             shown.update(_status(*states))
     assert said.getvalue().splitlines() == [
         "starting: loading JAX, building the environments  0:00",
-        f"{WHY}usually 1 to 3 minutes  0:00",
-        f"{WHY}usually 1 to 3 minutes  0:31",
+        f"{WHY}up to 3 minutes  0:00",
+        f"{WHY}up to 3 minutes  0:31",
         "compiled in 0:42",
     ]
     assert compile_time().last_s == 42
@@ -246,7 +250,7 @@ def test_a_job_without_metrics_says_what_it_does_once_it_runs(
             clock.now_s += 20
     assert said.getvalue().splitlines() == [
         "starting: loading JAX, building the environments  0:00",
-        f"{WHY}usually 1 to 3 minutes  0:00",
+        f"{WHY}up to 3 minutes  0:00",
         "compiled in 0:20",
         "playing 16 episodes  0:00",
     ]
@@ -307,6 +311,19 @@ def test_what_a_stop_waits_for_is_said_once(is_terminal: bool, monkeypatch: pyte
         for state in ("running", "stopping", "stopping", "done"):
             shown.update(_status(state, state))
     assert said.getvalue().count("then saving; a second Ctrl-C ends at once, without saving") == 1
+
+
+def test_a_stop_names_the_signal_that_asked_for_it():
+    signals, said = StopSignals(), io.StringIO()
+    signals.handle(signal.SIGTERM)
+    asked = GmiStatus(0, "stopping", 3, None, None, signals.name)
+    ConsoleProgress(Console(file=said, width=300), list, 10).update((asked,))
+    assert "a second SIGTERM ends at once" in said.getvalue()
+    said = io.StringIO()
+    view = SweepView(Console(file=said, width=300), [], SweepConfig())
+    for _ in range(2):
+        view.update(signals.name)
+    assert said.getvalue().count("a second SIGTERM ends them at once") == 1
 
 
 def test_figures_of_before_a_restart_are_not_shown_while_it_compiles_again():

@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from supervision import save
@@ -20,6 +21,7 @@ from gmijax.runs.folder import META, RunPaths, read_json, write_json
 from gmijax.runs.held import locked
 from gmijax.runs.resume import (
     CheckpointMeta,
+    choose_checkpoint,
     file_check,
     find_checkpoint,
     last_run,
@@ -88,6 +90,40 @@ def test_last_is_the_run_with_the_newest_checkpoint(
     (old.checkpoint(900) / "note").touch()
     (old.checkpoints / "000000001000").mkdir()
     assert last_run("run.dir") == new.root
+
+
+def test_what_last_passes_over_is_said_if_it_is_newer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    runs = Path("runs")
+
+    def begun(name: str, when_s: float, config: dict[str, Any] | None = None) -> RunPaths:
+        run = make_run(runs / name)
+        write_json(run.config, read_json(run.config) if config is None else config)
+        write_json(run.plan, {})
+        os.utime(run.config, (when_s, when_s))
+        return run
+
+    def said() -> tuple[str, ...]:
+        return choose_checkpoint("last", "run.resume")[1]
+
+    chosen = make_run(runs / "chosen", 100)
+    os.utime(chosen.checkpoint(100) / META, (2e9, 2e9))
+    begun("older", 1e9)
+    begun("served", 3e9, {"policy": "random"})
+    (runs / "note").mkdir()
+    assert said() == ()
+    begun("stopped", 3e9)
+    job = make_run(runs / "swept" / "000", 50)
+    os.utime(job.checkpoint(50) / META, (1e9, 1e9))
+    none = "runs/stopped (no checkpoint)"
+    assert said() == (f"last is runs/chosen; newer, but passed over: {none}",)
+    os.utime(job.checkpoint(50) / META, (3e9, 3e9))
+    swept = "runs/swept (a sweep; its newest run: runs/swept/000)"
+    assert said() == (f"last is runs/chosen; newer, but passed over: {none}, {swept}",)
+    # Who names a run, means it.
+    assert choose_checkpoint("runs/chosen", "run.resume")[1] == ()
 
 
 @pytest.mark.parametrize(

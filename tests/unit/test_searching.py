@@ -185,11 +185,33 @@ def test_more_time_is_advised_where_nothing_ended_in_time_and_only_there(profile
 
     profiles(late)
     advice = "; raise search.budget_s, or use smaller sizes in search.num_envs"
-    with pytest.raises(GmijaxError, match=rf"no point of the search can run; .* is slow{advice}$"):
+    with pytest.raises(
+        GmijaxError, match=rf"no point of the search can run; .* is slow{advice} \(logs: "
+    ):
         found()
     profiles(lambda point: NotRunnable(f"{point} has no room"))
-    with pytest.raises(GmijaxError, match=r"no point of the search can run; .* has no room$"):
+    with pytest.raises(
+        GmijaxError, match=r"no point of the search can run; .* has no room \(logs: "
+    ):
         found("search.store=other")
+
+
+@pytest.mark.parametrize("end", [JobInterrupted("stopped"), None])
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_search_without_a_single_profile_leaves_no_folder(
+    profiles: Use, end: JobInterrupted | None, is_first: bool
+):
+    def answer(point: Point) -> Measured | NotRunnable:
+        if end is not None and len(asked.asked) == (1 if is_first else 2):
+            raise end
+        return NotRunnable(f"{point} has no room")
+
+    asked = profiles(answer)
+    with pytest.raises(GmijaxError):
+        found()
+    folders = list(Path("runs").iterdir())
+    # With a profile that failed there are its logs.
+    assert len(folders) == (0 if end is not None and is_first else 1)
 
 
 def test_a_profile_cut_off_by_the_budget_is_no_answer(

@@ -52,10 +52,20 @@ def policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         (["env=ant"], "env=ant: no policy of it is shipped; allowed: ball_balance"),
         ([], "checkpoint=shipped: of which task? Add env=TASK; there are ball_balance"),
-        (["env=ball_balance", "deterministic=false"], "deterministic=False: allowed with"),
-        (["env=ball_balance", "randomize=on"], "randomize=on: allowed with checkpoint=shipped is"),
-        (["env=ball_balance", "physics.impl=warp"], "physics.impl=warp: allowed with"),
-        (["env=ball_balance", "run.dir=x"], "run.dir=x: allowed with checkpoint=shipped is null"),
+        (
+            ["env=ball_balance", "deterministic=false"],
+            "with deterministic; remove deterministic=false",
+        ),
+        (
+            ["env=ball_balance", "randomize=on"],
+            "checkpoint=shipped cannot be combined with randomize",
+        ),
+        (["env=ball_balance", "physics.impl=warp"], "physics.impl; remove physics.impl=warp"),
+        (
+            ["run.dir=last"],
+            "checkpoint=shipped cannot be combined with run.dir; remove run.dir=last",
+        ),
+        (["env=ball_balance", "run.dir=x"], "with run.dir; remove run.dir=x"),
     ],
 )
 def test_what_cannot_be_played_is_one_line(

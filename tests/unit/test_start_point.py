@@ -22,7 +22,7 @@ from gmijax.control.start_point import (
     require_replay_fits,
 )
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import META, RunPaths, read_json, write_json
+from gmijax.runs.folder import META, RunPaths, create_run, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta
 
 
@@ -143,9 +143,22 @@ def test_a_saved_replay_has_to_fit_only_where_it_is_gone_on_with(tmp_path: Path)
     assert line.startswith("replay of 524,288 transitions (MiB")
 
 
+def test_what_is_no_run_folder_is_not_said_to_be_one(tmp_path: Path):
+    docs = tmp_path / "docs"
+    docs.mkdir()
+    with pytest.raises(ConfigError, match=r"already; run\.resume=auto continues in it$"):
+        find_start_point(compose("env=ant", f"run.dir={docs}"))
+    (docs / "index.md").touch()
+    refusal = rf"^run\.dir={docs}: is not a run folder, and is not empty$"
+    with pytest.raises(ConfigError, match=refusal):
+        find_start_point(compose("env=ant", f"run.dir={docs}"))
+    with pytest.raises(ConfigError, match=refusal):
+        create_run(str(docs), None, "ant")
+
+
 def test_auto_leaves_a_folder_with_something_else_alone(tmp_path: Path):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(ConfigError, match="is neither a run folder nor empty"):
+    with pytest.raises(ConfigError, match="is not a run folder, and is not empty"):
         find_start_point(config_of(tmp_path))
     with pytest.raises(ConfigError, match="is not a folder"):
         find_start_point(config_of(tmp_path / "thesis.tex"))

@@ -134,6 +134,11 @@ def test_a_value_of_a_window_that_is_not_full_is_marked_where_it_is_shown() -> N
         job.progress.state = "running"
         view.update()
     assert "9 8 (early) " in " ".join(terminal.getvalue().split())
+    job.progress.state = "interrupted"
+    interrupted = io.StringIO()
+    with view_on(interrupted, [job]) as view:
+        view.update()
+    assert "s, return 8 so far; " in interrupted.getvalue()
     job.progress.state = "completed"
     with view_on(said, [job]) as view:
         view.update()

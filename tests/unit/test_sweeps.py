@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from supervision import gpu, machine
 
 from gmijax.autotune.grid import Measured, NotRunnable
 from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
+from gmijax.cli.pack import build_pack
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import open_console
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, JobInterrupted
 from gmijax.runs.folder import read_json, write_json
 from gmijax.runs.held import OpenFolder, is_locked, locked
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.stop_signals import StopSignals
-from gmijax.sweeps import curve_window, jobs_per_gpu
+from gmijax.sweeps import curve_window, jobs_per_gpu, runner
+from gmijax.sweeps.by_setting import name_of_middle, seed_summary
 from gmijax.sweeps.curve_window import CurveWindow
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import Job, jobs_of, placed, require_placeable, state_of
@@ -35,6 +40,7 @@ from gmijax.sweeps.profile_jobs import profiled_job
 from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import JobsReport, spread, tables
 from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
+from gmijax.sweeps.words import announce
 
 
 @pytest.mark.parametrize(
@@ -504,6 +510,43 @@ def test_settings_come_first_with_the_interquartile_mean_of_their_seeds(tmp_path
         "10.75",
         "0 1 2 3",
     )
+
+
+@pytest.mark.parametrize(
+    ("values", "middle", "name"),
+    [
+        ((1.0, 9.0), 5.0, "mean"),
+        ((1.0, 2.0, 9.0), 2.0, "median"),
+        ((1.0, 2.0, 4.0, 9.0), 3.0, "interquartile mean"),
+        ((1.0, 2.0, 3.0, 4.0, 90.0), 3.0, "interquartile mean"),
+    ],
+)
+def test_the_middle_of_few_seeds_is_called_what_it_is(
+    values: tuple[float, ...], middle: float, name: str
+) -> None:
+    assert seed_summary(np.array(values)).mean == middle
+    assert name_of_middle(len(values)) == name
+
+
+def test_a_sweep_that_stops_prints_the_whole_command_that_goes_on(tmp_path: Path) -> None:
+    words = ["env=ant", "run.dir=here", "algo.entropy_cost=1e-2,3e-2"]
+    work = build_sweep(words)
+    error = JobInterrupted("interrupted")
+    runner._say_how_to_continue(error, work, list(work.jobs), SweepPaths(tmp_path / "a b"))
+    (note,) = error.__notes__
+    *_, folder, task, rate = shlex.split(note.removeprefix("to continue: "))
+    assert (folder, task, rate) == (f"run.dir={tmp_path}/a b", words[0], words[2])
+    pack = build_pack(["seed=0,1", "run.name=x"], ["echo", "{seed}", "run.dir=own"])
+    assert pack.words == ("seed=0,1", "--", "echo", "{seed}", "run.dir=own")
+
+
+@pytest.mark.parametrize("overrides", [(), ("seed=0,1",)])
+def test_a_sweep_without_a_list_says_that_it_is_one_job(overrides: tuple[str, ...]) -> None:
+    work, said = build_sweep(["env=ant", *overrides]), io.StringIO()
+    here = machine(0)
+    site = Site(plan_slots(work.ranking, here, {"auto"}), here)
+    announce(Console(file=said, width=300), [site], work, 0)
+    assert ("one job, because no key has several values" in said.getvalue()) == (not overrides)
 
 
 def test_the_middle_of_curves_leaves_out_the_outer_quarters() -> None:
