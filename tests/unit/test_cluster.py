@@ -81,7 +81,7 @@ def joined(node: RemoteNode, versions: dict[str, str | None] | None = None) -> l
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("cluster.engine=slurm",), "cluster.engine=slurm: expected one of ray or null"),
+        (("cluster.engine=slurm",), "cluster.engine=slurm: expected ray or null"),
         (("cluster.address=ray://head:10001",), "must be started on a node of the cluster"),
         (("cluster.engine=ray", "algo=a3c"), "nodes=auto: with algo=a3c give a number"),
         (("cluster.engine=ray", "plan.template=tdg_ex"), "template=tdg_ex: not with cluster"),
