@@ -70,7 +70,9 @@ def test_films_are_drawn_on_the_cpu_if_they_can_be(
 
 def test_without_opengl_training_with_films_is_bad_input(works: set[str]):
     assert find_opengl(config_of()) is None
-    with pytest.raises(ConfigError, match=r"=3: no headless .* no egl; without it, use eval.video=false$") as caught:
+    with pytest.raises(
+        ConfigError, match=r"=3: no headless .* no egl; without it, use eval.video=false$"
+    ) as caught:
         find_opengl(config_of("eval.video=3"))
     assert "\n" not in str(caught.value)
 
