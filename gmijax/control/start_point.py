@@ -17,7 +17,7 @@ from gmijax.runs.folder import (
     RunPaths,
     create_run,
     given_run,
-    is_anothers,
+    holds_something_else,
     read_json,
     replays_of,
     require_new_run,
@@ -110,7 +110,7 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
             raise ConfigError(f"{shown} is not a folder")
         return StartPoint()
     run = RunPaths(folder.resolve())
-    if is_anothers(run.root):
+    if holds_something_else(run.root, own=run.config, lock=run.lock):
         raise ConfigError(f"{shown} {NO_RUN_FOLDER}")
     if not run.config.exists():
         return StartPoint(run)

@@ -214,16 +214,15 @@ def require_new_run(run_dir: str | None, name: str | None, hint: str = "") -> No
     what = f"the run folder exists already{hint}"
     if not root.is_dir():
         what = "not a folder"
-    elif is_anothers(root):
+    elif holds_something_else(root, own=RunPaths(root).config, lock=RunPaths(root).lock):
         what = NO_RUN_FOLDER
     key = "run.dir" if run_dir else "run.name"
     raise ConfigError(f"{key}={root}: {what}")
 
 
-def is_anothers(folder: Path) -> bool:
-    """Whether a folder has something in it that is no run."""
-    run = RunPaths(folder)
-    return not run.config.exists() and any(path != run.lock for path in folder.iterdir())
+def holds_something_else(folder: Path, *, own: Path, lock: Path) -> bool:
+    """Whether a folder has something in it, but not the file `own`, which every job's has."""
+    return not own.exists() and any(path != lock for path in folder.iterdir())
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:

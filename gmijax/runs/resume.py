@@ -266,9 +266,9 @@ def newer_than(checkpoint: Path) -> tuple[str, ...]:
     since_s, named = _written_s(checkpoint)[0], list[str]()
     for folder in _folders_in(RUNS):
         jobs = [path for job in _folders_in(folder) for path in checkpoints_of(job)[-1:]]
-        if jobs and max(_written_s(path)[0] for path in jobs) > since_s:
-            newest = max(jobs, key=_written_s).parents[1]
-            named.append(f"{folder} (a sweep; its newest run: {newest})")
+        newest = max(jobs, key=_written_s, default=None)
+        if newest is not None and _written_s(newest)[0] > since_s:
+            named.append(f"{folder} (a sweep; its newest run: {newest.parents[1]})")
         elif _is_unsaved_training(folder) and _begun_s(folder) > since_s:
             named.append(f"{folder} (no checkpoint)")
     if not named:

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from gmijax.errors import ConfigError, FolderLost, SweepFailed
-from gmijax.runs.folder import create_run, given_run
+from gmijax.runs.folder import create_run, given_run, holds_something_else
 from gmijax.runs.held import is_locked
 from gmijax.sweeps.any_job import J
 from gmijax.sweeps.paths import SweepPaths
@@ -44,7 +44,7 @@ def _found(folder: Path, work: Work[J]) -> Path:
     if not folder.is_dir():
         raise ConfigError(f"run.dir={folder}: is not a folder")
     paths = work.paths(folder.resolve())
-    if not paths.request.exists() and any(path != paths.lock for path in folder.iterdir()):
+    if holds_something_else(paths.root, own=paths.request, lock=paths.lock):
         raise ConfigError(f"run.dir={folder}: is not a {work.name} folder, and is not empty")
     return paths.root
 
