@@ -13,9 +13,9 @@ With `--gpus` seeds are trained and tested at the same time, each on a GPU of it
 of the cores.
 
 `--script` trains with Playground's own script (Brax's PPO) too, in turn with ours, with its own
-settings but for these flags. Its short training has as many steps as it makes between two
-evaluations: their number is part of its program. Adds a call to
-`benchmarks/results/walking-<task>-<device>.json`.
+settings but for these flags, with the last `--script-seeds` of the seeds. Its short training has
+as many steps as it makes between two evaluations: their number is part of its program. Adds a call
+to `benchmarks/results/walking-<task>-<device>.json`.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ class Benchmark:
         self._trained_by_s = self._deadline_s - given.reserve_s
         self._machine = detect_machine()
         self.file = results_file(given, "walking", f"-{config.env.slug}", gpus=1)
+        self._script_seeds = given.seeds if given.script_seeds is None else given.script_seeds
         self.runs: list[dict[str, Any]] = []
         self._codes_of_tests: list[int] = []
 
@@ -91,6 +92,8 @@ class Benchmark:
         mine: list[dict[str, Any]] = []
         for number, trainer in in_turn(trainers, len(seeds), self._trained_by_s):
             seed = seeds[number]
+            if trainer == SCRIPT and seed < self._given.seeds - self._script_seeds:
+                continue
             run = {"trainer": trainer, "seed": seed, **self._train(trainer, str(seed), part)}
             mine.append(run)
             self.runs.append(run)
@@ -290,6 +293,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--test-seed", type=int, default=0, help="of the test's starts")
     parser.add_argument("--cold", action="store_true", help="compile in every training")
     parser.add_argument("--script", help="train with Playground's script too, with these flags")
+    parser.add_argument("--script-seeds", type=int, help="trainings by it; default: --seeds")
     parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
     parser.add_argument("--reserve-s", type=float, default=150.0, help="of these, for the tests")
     parser.add_argument("--runs", type=Path, help="keep the trainings here, without environments")

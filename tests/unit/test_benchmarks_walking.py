@@ -301,8 +301,13 @@ def test_one_program_tests_all_checkpoints_of_a_kind(tmp_path, monkeypatch):
     assert made == [("g1", {"num_envs": 4, "seed": 7})] * 2
 
 
-@pytest.mark.parametrize("works", [True, False])
-def test_a_call_trains_tests_and_writes_what_it_found(works, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("works", "script_seeds", "by_script"),
+    [(True, (), [0, 1]), (False, (), [0, 1]), (True, ("--script-seeds=1",), [1])],
+)
+def test_a_call_trains_tests_and_writes_what_it_found(
+    works, script_seeds, by_script, tmp_path, monkeypatch
+):
     commands = []
 
     def run(command, deadline_s, variables):
@@ -330,7 +335,7 @@ def test_a_call_trains_tests_and_writes_what_it_found(works, tmp_path, monkeypat
         [
             *("walking", "env=go1", "num_envs=64", "num_timesteps=20480", "--seeds", "2"),
             *("--script=--impl=jax", f"--out={tmp_path}", f"--runs={tmp_path}", "--tests=4"),
-            *("--envs=100",),
+            *("--envs=100", *script_seeds),
         ],
     )
     assert walking.main() == (0 if works else 1)
@@ -339,7 +344,7 @@ def test_a_call_trains_tests_and_writes_what_it_found(works, tmp_path, monkeypat
     every = [one for one in ours[1] if one.startswith("run.checkpoint_every=")]
     assert gmijax.compose(*ours[1][3:]).run.checkpoint_every == int(every[0].split("=")[1]) > 1
     theirs = [command for command, _ in commands if "--impl=jax" in command]
-    assert len(theirs) == 3
+    assert [command[-1] for command in theirs[1:]] == [f"--seed={seed}" for seed in by_script]
     assert {"--env_name=Go1JoystickFlatTerrain", "--num_evals=5"} <= set(theirs[1])
     # How long a part is is compiled in.
     assert theirs[0][-2:] == ["--num_timesteps=50000000", "--num_evals=2"]
