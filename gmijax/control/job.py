@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -201,6 +202,10 @@ class _TrainingJob:
         if attempt:
             self._look_again()
         config = started_from(self._config, checkpoint)
+        if attempt and config.run.profile is not None:
+            # A tracer can be what failed, and would fail there again.
+            config = replace(config, run=replace(config.run, profile=None))
+            self._console.print(f"run.profile={self._config.run.profile}: not traced again")
         if (lost := forgotten(config, self._plan)) is not None:
             self._console.print(lost)
         write_json(self._run.config, to_dict(config))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import json
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -53,22 +55,39 @@ class IterationTrace:
         if self._wanted is not None and iteration == self._wanted[1]:
             wait()  # The device may still compute it.
             self._step.close()
-            self._write()
+            self._stop()
         self._step.close()
 
     def close(self) -> None:
         """Returns when all that was traced is written; the device must have nothing left to do."""
         self._step.close()
-        self._write()
+        self._stop()
         if self._writing is not None:
             self._writing.join()
 
-    def _write(self) -> None:
-        """Ends the trace if it is open. Not in this thread: to write it may take a minute."""
+    def _stop(self) -> None:
+        """Ends the trace if it is open, and writes it.
+
+        In this thread, so that nothing is launched meanwhile: a kernel that is launched while the
+        tracer detaches from a GPU can fail, and the process loses the GPU with it.
+        """
         if self._is_open:
             self._is_open = False
-            self._writing = Thread(target=self._try, args=(jax.profiler.stop_trace,), daemon=True)
+            self._try(jax.profiler.stop_trace)
+            if self._error is not None:
+                return
+            # It may take a minute, and needs no device.
+            self._writing = Thread(target=self._try, args=(self._for_perfetto,), daemon=True)
             self._writing.start()
+
+    def _for_perfetto(self) -> None:
+        """Writes the events once more, as Perfetto reads them: without JAX's metadata."""
+        traces = self._folder.glob("plugins/profile/*/*.trace.json.gz")
+        newest = max(traces, key=lambda path: path.stat().st_mtime)
+        trace = json.loads(gzip.decompress(newest.read_bytes()))
+        trace.pop("metadata", None)
+        written = gzip.compress(json.dumps(trace).encode())
+        newest.with_name("perfetto_trace.json.gz").write_bytes(written)
 
     def outcome(self) -> dict[str, Any] | None:
         """First and last iteration, folder and error; None where nothing was to be written.
@@ -85,9 +104,7 @@ class IterationTrace:
         options = jax.profiler.ProfileOptions()
         # Calls of Python are many, slow the iteration down, and say little about it.
         options.python_tracer_level = 0
-        jax.profiler.start_trace(
-            self._folder, create_perfetto_trace=True, profiler_options=options
-        )
+        jax.profiler.start_trace(self._folder, profiler_options=options)
         self._is_open = True
 
     def _try(self, act: Callable[[], None]) -> None:

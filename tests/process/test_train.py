@@ -184,6 +184,24 @@ def test_a_killed_gmi_ends_the_job_and_is_named(tmp_path: Path) -> None:
     assert _read(run / "summary.json")["status"] == "failed"
 
 
+@pytest.mark.timeout(300)
+def test_a_run_that_starts_again_is_not_traced_again(tmp_path: Path) -> None:
+    """The tracer may be what failed."""
+    run = tmp_path / "run"
+    again = ("run.profile=2:3", "run.checkpoint_every=2", "run.max_restarts=1")
+    job = start(*POINT, FOREVER, *again, "run.dir=run", cwd=tmp_path)
+    wait_until(lambda: any(run.glob("checkpoints/[0-9]*")), 120, "a checkpoint")
+    pid = gmi_pid(run, 0)
+    assert pid is not None
+    kill(pid)
+    wait_until(lambda: bool(events(run, "recovered")), 120, "a recovery")
+    job.send_signal(signal.SIGINT)
+    assert job.wait(timeout=90) == 130
+    assert "run.profile=2:3: not traced again" in (tmp_path / "stdout.txt").read_text()
+    assert len(list(run.glob("profile/plugins/profile/*"))) == 1
+    assert "profile" not in _read(run / "summary.json")
+
+
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize(
     "plan",
