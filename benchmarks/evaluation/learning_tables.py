@@ -198,8 +198,9 @@ def _kind_of_walking(call: Call) -> tuple[str, str, str | None, bool]:
 
 @table_of_calls(
     "walking",
-    "task | trained by | programs | seeds that walk: | million steps: | seconds of training: | "
-    "seconds of the command: | at the end: million steps: | do not fall: | error, m/s: | rad/s:",
+    "task | MJX | trained by | programs | seeds that walk: | million steps: | "
+    "seconds of training: | seconds of the command: | at the end: million steps: | "
+    "do not fall: | error, m/s: | rad/s:",
     lambda: newest("walking-*-nvidia-*.json", _kind_of_walking),
 )
 def walking(calls: Calls) -> Rows:
@@ -213,7 +214,15 @@ def walking(calls: Calls) -> Rows:
                 _spread(row["env_steps"], 1e-6),
                 *(_spread(row[key]) for key in ("training_s", "command_s")),
             )
-            yield [f"`{task}`", name, start, seeds, *spreads, *_last_tests(call, trainer)]
+            about = [f"`{task}`", _physics(call, trainer), name, start, seeds]
+            yield [*about, *spreads, *_last_tests(call, trainer)]
+
+
+def _physics(call: Call, trainer: str) -> str:
+    """The MJX implementation that this trainer's policies were trained and tested with."""
+    runs = [run["checkpoints"] for run in call.results["runs"] if run["trainer"] == trainer]
+    found = (one["walk"]["impl"] for checkpoints in runs for one in checkpoints if "walk" in one)
+    return next(found, "")
 
 
 def seconds_until_it_walks(task: str) -> Figure | None:

@@ -24,7 +24,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from benchmarks.peers.comparisons import BraxTraining
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import read_json, write_json
-from gmijax.sim.adapters.playground import import_playground, without_warnings
+from gmijax.sim.adapters.playground import without_warnings
+from gmijax.sim.adapters.playground_package import import_playground
 from gmijax.sim.registry import make_env
 from gmijax.types import PyTree
 

@@ -23,6 +23,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from gmijax.sim.adapters.playground_package import import_playground
+
 POINTS = 60
 
 
@@ -94,7 +96,7 @@ def patch_environments(impl: str, curve: Curve, *, has_gpu: bool) -> None:
     )
     theirs: Any = importlib.import_module("environments.mujoco_playground_env")
     torch_wrapper: Any = theirs.wrapper_torch
-    registry = adapter.import_playground().registry
+    registry = import_playground().registry
     to_torch, load, make_env = torch_wrapper._jax_to_torch, registry.load, theirs.make_env
 
     def load_as_ours(name: str, config: Any) -> Any:

@@ -12,7 +12,7 @@ import sys
 import jax
 
 from benchmarks.peers.brax_ppo import replicated
-from gmijax.sim.adapters.playground import import_playground
+from gmijax.sim.adapters.playground_package import import_playground
 
 
 def main() -> None:

@@ -38,7 +38,8 @@ def models(tmp_path, monkeypatch):
 
 def configured(robot: str, models, **settings) -> tuple[Any, dict[str, Any]]:
     """Playground's task, and the metadata of its export."""
-    from gmijax.sim.adapters.playground import configuration, import_playground
+    from gmijax.sim.adapters.playground import configuration
+    from gmijax.sim.adapters.playground_package import import_playground
     from gmijax.sim.robots import ROBOT_SETTINGS, playground_name
     from gmijax.sim.tasks.settings import settings_from
 

@@ -1,8 +1,4 @@
-"""Environments of MuJoCo Playground: `env=go1`, `env=playground env.name=CartpoleBalance`.
-
-Playground looks for the robot models of MuJoCo Menagerie in its own package, and clones them
-there from GitHub. Here they come from where `robot_models` finds them.
-"""
+"""Environments of MuJoCo Playground: `env=go1`, `env=playground env.name=CartpoleBalance`."""
 
 from __future__ import annotations
 
@@ -12,7 +8,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -23,10 +18,11 @@ from gmijax.config.schema import flatten, suggestion
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters.brax_interface import adapt
 from gmijax.sim.adapters.checks import attempt
+from gmijax.sim.adapters.playground_package import import_playground
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.physics import which_overflowed
-from gmijax.sim.robot_models import has_randomizer, model_folder
+from gmijax.sim.robot_models import has_randomizer
 from gmijax.sim.robots import BUFFERS, ROBOT_SETTINGS, playground_name
 from gmijax.sim.tasks.settings import settings_from
 from gmijax.types import Array, PRNGKey, PyTree
@@ -85,26 +81,6 @@ def configuration(name: str, settings: Mapping[str, float]) -> dict[str, Any]:
     changed = _changed(name, flatten(config.to_dict()), {}, settings)
     config.update_from_flattened_dict(changed)
     return config.to_dict()
-
-
-def import_playground() -> Any:
-    """The package `mujoco_playground`, which finds models as `robot_models` does."""
-    # By name: it is not installed where gmijax is checked.
-    package = attempt("env=playground", importlib.import_module, "mujoco_playground")
-    base: Any = importlib.import_module("mujoco_playground._src.mjx_env")
-    base.MENAGERIE_PATH = _Models()
-    return package
-
-
-class _Models:
-    """Stands for Playground's folder of models: what it asks for one is looked up."""
-
-    def exists(self) -> bool:
-        """Playground clones all models if not."""
-        return True
-
-    def __truediv__(self, name: str) -> Path:
-        return model_folder(name)
 
 
 def _drawn(theirs: Any, randomize: Callable[..., Any], keys: PRNGKey) -> dict[str, Array]:
