@@ -24,6 +24,7 @@ from __future__ import annotations
 import re
 import time
 import unicodedata
+from pathlib import Path
 from typing import NamedTuple
 
 TERMINAL_COMMAND = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[ -~])")
@@ -55,7 +56,15 @@ class ConfigError(GmijaxError):
 
 
 class NoCheckpointYet(ConfigError):
-    """The checkpoint that is asked for is still to come: the run is being trained."""
+    """The checkpoint that is asked for is still to come: the run is being trained.
+
+    Attributes:
+      run: folder of the run.
+    """
+
+    def __init__(self, message: str, run: Path) -> None:
+        super().__init__(message)
+        self.run = run
 
 
 class BackendUnavailable(ConfigError):

@@ -98,7 +98,8 @@ def train(config: TrainConfig, *, show: Show = False) -> Result:
         if config.cluster.engine is not None:
             cluster = held.enter_context(ClusterJob(config))
             nodes = cluster.join(start_point.root(config))
-        decided = decide(started_from(config, start_point.checkpoint), console, nodes)
+        started = started_from(config, start_point.checkpoint, console.print)
+        decided = decide(started, console, nodes)
         return _train(decided, start_point, console, cluster, opengl, started_s)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shlex
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -31,8 +31,8 @@ from gmijax.runs.names import attempt_folders, gmi_folders
 from gmijax.runs.resume import (
     CheckpointMeta,
     checkpoints_of,
+    choose_checkpoint,
     drop_unfinished,
-    find_checkpoint,
 )
 from gmijax.runs.saved_config import saved_config
 from gmijax.sim import source
@@ -110,18 +110,27 @@ def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:
     copy_history(run.metrics, run.metrics, steps)
 
 
-def started_from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
+def started_from(
+    config: TrainConfig, checkpoint: Path | None, note: Callable[[str], None] = lambda _: None
+) -> TrainConfig:
     """The configuration with `run.resume` as the path of a checkpoint, or null.
 
     What else it takes from other runs is the path of a checkpoint from then on too, so that all
-    GMIs, restarts and resumed runs take the same.
+    GMIs, restarts and resumed runs take the same. `note` is told what was passed over for it.
 
     Raises:
       ConfigError: there is no such checkpoint.
     """
+
+    def find(wanted: str, key: str) -> Path:
+        found, passed_over = choose_checkpoint(wanted, key)
+        for text in passed_over:
+            note(f"{key}: {text}")
+        return found
+
     resume = None if checkpoint is None else str(checkpoint)
     run = dataclasses.replace(config.run, resume=resume)
-    return dataclasses.replace(config, run=run, algo=config.algo.with_checkpoints(find_checkpoint))
+    return dataclasses.replace(config, run=run, algo=config.algo.with_checkpoints(find))
 
 
 def record_end(

@@ -22,6 +22,9 @@ from gmijax.errors import ConfigError, NoCheckpointYet
 from gmijax.player.plain_env import PlainEnv, task_of
 from gmijax.player.policy import PlainPolicy, checkpoint_policy
 from gmijax.player.shipped import require_alone, require_shipped, shipped_policy
+from gmijax.runs.folder import RunPaths
+from gmijax.runs.saved_config import task_of_run
+from gmijax.sim.registry import require_own
 from gmijax.viewer.checkpoints import Checkpoints
 from gmijax.viewer.guard import Guard, is_loopback
 from gmijax.viewer.installed import INSTALL, missing
@@ -88,6 +91,8 @@ def opened_once_saved(
             except NoCheckpointYet as error:
                 if not is_waiting:
                     require_packages()  # Rather now than after the wait.
+                    if RunPaths(error.run).config.exists():
+                        require_own(task_of_run(error.run))
                     waiting.enter_context(doing(console, f"waiting: {error}"))
                 is_waiting = True
             time.sleep(_POLL_S)

@@ -188,7 +188,7 @@ def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
         return found.checkpoint, (*found.passed_over, *newer)
     if found.checkpoint is None:
         if not found.passed_over and is_training(folder):
-            raise NoCheckpointYet(f"{key}={wanted}: {first_checkpoint_of(folder)}")
+            raise NoCheckpointYet(f"{key}={wanted}: {first_checkpoint_of(folder)}", folder)
         raise ConfigError(
             "; ".join((f"{key}={wanted}: {_no_checkpoint(folder)}", *found.passed_over))
         )
@@ -244,7 +244,8 @@ def last_run(key: str) -> Path:
     """
     found = {path: run for run in _folders_in(RUNS) for path in checkpoints_of(run)[-1:]}
     if not found and (unsaved := unsaved_runs()):
-        raise NoCheckpointYet(f"{key}=last: {unsaved[0]}: {first_checkpoint_of(unsaved[0])}")
+        run = unsaved[0]
+        raise NoCheckpointYet(f"{key}=last: {run}: {first_checkpoint_of(run)}", run)
     if not found:
         raise ConfigError(
             f"{key}=last: no run with a checkpoint in {RUNS}/; train one: "

@@ -52,6 +52,11 @@ def saved_config(checkpoint: Path) -> dict[str, Any]:
     return saved
 
 
+def task_of_run(run: Path) -> EnvConfig:
+    """The task of a training run, with or without checkpoints; errors as of `trained_config`."""
+    return trained_config(RunPaths(run).checkpoint(0))[0]
+
+
 def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
     """Task and algorithm of the run that a checkpoint lies in.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +34,14 @@ SAVING = (
 def test_a_student_keeps_its_teacher_and_goes_on(tmp_path: Path) -> None:
     done = train(*POINT, "num_timesteps=640", "run.dir=runs/teacher", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    begun = tmp_path / "runs" / "begun"  # Later, and nothing is saved of it.
+    begun.mkdir()
+    for name in ("config.json", "plan.json"):
+        shutil.copy(tmp_path / "runs" / "teacher" / name, begun)
     line = ("algo=distill", "algo.teacher=last", "plan.gpus=2", "num_timesteps=1024")
     done = train(*BASE, *line, "run.dir=runs/student", "run.checkpoint_every=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert "algo.teacher: last is runs/teacher; newer, but passed over: runs/begun" in done.stdout
     student = tmp_path / "runs" / "student"
     teacher = json.loads((student / "config.json").read_text())["algo"]["teacher"]
     assert Path(teacher).parent == tmp_path / "runs" / "teacher" / "checkpoints"

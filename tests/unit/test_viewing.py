@@ -13,6 +13,7 @@ from gmijax.config import ViewConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import open_console
 from gmijax.deploy import viewing
+from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.runs.held import locked
 
@@ -44,3 +45,17 @@ def test_it_waits_for_the_first_checkpoint_of_a_training(
         "waiting: run.dir=last: runs/x: still training, no checkpoint yet; the first is saved "
         "after 7 iterations (run.checkpoint_every)\n"
     )
+
+
+def test_it_does_not_wait_for_a_task_that_it_cannot_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = RunPaths(Path("runs") / "x")
+    run.root.mkdir(parents=True)
+    monkeypatch.setattr(viewing, "missing", tuple)
+    config, console = build("view", ViewConfig, ()), open_console(show=False)
+    with locked(run.lock, "x"):
+        write_json(run.config, to_dict(compose("env=playground", "env.name=CartpoleBalance")))
+        with pytest.raises(ConfigError, match="only our own tasks are played without jax"):
+            viewing.opened_once_saved(config, console)
