@@ -1,7 +1,8 @@
 """`sweep.jobs_per_gpu=auto`: how many jobs at a time make the most steps, by profiling.
 
 One job, two, four and so on train at the same time on one GPU, until more of them gain nothing or
-cannot run. What was measured is kept in the profile store of `gmijax.search`.
+cannot run. What was measured is kept in the profile store of `gmijax.search`. Jobs that are over
+before that pays run at the same time, as far as memory allows.
 """
 
 from __future__ import annotations
@@ -28,6 +29,14 @@ from gmijax.sweeps.slots import gmis_per_slot
 COUNTS = (1, 2, 4, 8, 16, 32)
 CORES_OF_A_JOB = 2
 """On a machine without GPUs."""
+
+_SHORT_S = 120.0
+"""Training that takes less, one job after another, gains nothing by more profiles: each number of
+jobs takes about half a minute."""
+
+_MOST_UNMEASURED = 8
+_CONTEXT_MIB = 1024
+"""Of GPU memory for a process, beside its arrays."""
 
 
 def with_jobs_per_gpu(
@@ -100,37 +109,69 @@ def _best(
     More than `most` are not profiled, but for the number that is next to it. Up to `together` of
     them are one program.
     """
-    config = job.config
+    config, task = job.config, job.config.env.label
     own = {"job": "sweep", "size": _size(job)}
     key = workload_of(config).store_key(bench.host.machine) | own
     store = ProfileStore(config.search.store, key, console.print)
-    limit_s = config.search.profile_limit_s
     best, best_rate = 1, 0.0
     for count in COUNTS:
         if best >= most:
             break
-        point = Point(count, config.envs_per_gmi, str(config.physics.impl))
-        packed = min(count, together)
-        kind = "sweep" if packed == 1 else f"sweep {packed} together"
-
-        def measure(count: int = count) -> Measured | NotRunnable:
-            what = f"{config.env.label}: measuring {count} jobs at a time; they compile first"
-            with doing(console, what):
-                return profile_jobs(settings, job, count, bench, together)
-
-        found = store.kept_or(kind, point, measure, limit_s)
+        found = _profiled(settings, job, count, together, bench, store, console)
         if isinstance(found, NotRunnable):
-            console.print(
-                f"  {config.env.label}: {count} jobs at a time cannot run: {found.reason}"
-            )
+            console.print(f"  {task}: {count} jobs at a time cannot run: {found.reason}")
             break
         rate = count * found.env_steps_per_s
         console.print(
-            f"  {config.env.label}: {count} jobs at a time make {rate:,.0f} steps/s, "
+            f"  {task}: {count} jobs at a time make {rate:,.0f} steps/s, "
             f"{found.memory_mib:,.0f} MiB in each process"
         )
         if rate < best_rate * (1 + GAIN):
             break
         best, best_rate = count, rate
-    console.print(f"sweep.jobs_per_gpu={best} for {config.env.label}")
+        # What is known already costs nothing.
+        is_new = store.get(*_of_store(job, COUNTS[1], together)) is None
+        if count == 1 and together == 1 and is_new and _are_short(job, most, rate):
+            best = _that_fit(most, found, bench)
+            console.print(f"  {task}: all jobs are over before more is measured")
+            break
+    console.print(f"sweep.jobs_per_gpu={best} for {task}")
     return best
+
+
+def _profiled(
+    settings: SweepConfig,
+    job: Job,
+    count: int,
+    together: int,
+    bench: Bench,
+    store: ProfileStore,
+    console: Console,
+) -> Measured | NotRunnable:
+    """What so many jobs at a time do, kept or measured now."""
+
+    def measure() -> Measured | NotRunnable:
+        label = job.config.env.label
+        with doing(console, f"{label}: measuring {count} jobs at a time; they compile first"):
+            return profile_jobs(settings, job, count, bench, together)
+
+    kind, point = _of_store(job, count, together)
+    return store.kept_or(kind, point, measure, job.config.search.profile_limit_s)
+
+
+def _of_store(job: Job, count: int, together: int) -> tuple[str, Point]:
+    """Under which the store keeps it."""
+    packed = min(count, together)
+    kind = "sweep" if packed == 1 else f"sweep {packed} together"
+    return kind, Point(count, job.config.envs_per_gmi, str(job.config.physics.impl))
+
+
+def _are_short(job: Job, most: int, steps_per_s: float) -> bool:
+    """Whether as many jobs as each GPU has to run are soon over, one after another."""
+    return most * job.config.num_timesteps < _SHORT_S * steps_per_s
+
+
+def _that_fit(most: int, one: Measured, bench: Bench) -> int:
+    """As many of these jobs at a time as memory allows, at least one."""
+    memory_mib = min(gpu.memory_mib for gpu in bench.host.machine.gpus)
+    return max(1, min(most, _MOST_UNMEASURED, int(memory_mib / (one.memory_mib + _CONTEXT_MIB))))

@@ -625,6 +625,47 @@ def test_jobs_at_a_time_by_profiling(
 
 
 @pytest.mark.parametrize(
+    ("num_jobs", "num_timesteps", "memory_mib", "profiled", "expected"),
+    [
+        (3, 39e6, 100.0, [1], 3),
+        (3, 41e6, 100.0, [1, 2, 4], 2),
+        (30, 3.9e6, 100.0, [1], 8),
+        (8, 1e6, 20_000.0, [1], 6),
+        (8, 1e6, 90_000.0, [1], 1),
+    ],
+    ids=["short", "long", "many", "large", "as large as the GPU"],
+)
+def test_what_is_soon_over_is_not_profiled_for_long(
+    num_jobs: int,
+    num_timesteps: float,
+    memory_mib: float,
+    profiled: list[int],
+    expected: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[int] = []
+
+    def profile(_: SweepConfig, __: Job, count: int, *___: Any) -> Measured:
+        done.append(count)
+        return Measured(1e6 if count == 1 else 0.8e6 if count == 2 else 1e5, memory_mib, 0.1)
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(jobs_per_gpu, "profile_jobs", profile)
+    line = f"num_timesteps={int(num_timesteps)}"
+    jobs = jobs_of([compose(f"seed={seed}", line) for seed in range(num_jobs)])
+    hosts, quiet = [LocalHost(machine(1))], open_console(show=False)
+    found = with_jobs_per_gpu(SweepConfig(), jobs, hosts, quiet, StopSignals())
+    assert (found.jobs_per_gpu, done) == (expected, profiled)
+    # What was measured in a longer sweep is taken.
+    longer = jobs_of([compose(f"seed={seed}", "num_timesteps=1000000000") for seed in range(3)])
+    with_jobs_per_gpu(SweepConfig(), longer, hosts, quiet, StopSignals())
+    again = with_jobs_per_gpu(SweepConfig(), jobs, hosts, quiet, StopSignals())
+    assert again.jobs_per_gpu == min(2, num_jobs)
+    assert done == [1, 2, 4]
+
+
+@pytest.mark.parametrize(
     ("settings", "override", "expected"),
     [
         ({}, "plan.gpus=1", 2),
