@@ -37,11 +37,11 @@ PLANS = ((1, 65536), (4, 16384), (2, 32768))
 _NO_RATES, _NO_CHECKPOINTS = "run.measure_throughput=false", "run.checkpoint_every=0"
 
 
-def _throughput(task: str, impl: str, num_envs: int) -> Case:
+def _throughput(task: str, num_envs: int) -> Case:
     # A dozen iterations of the longest rollout: their median is the training rate.
     return _case(
-        f"{task} {impl} {num_envs}",
-        f"env={task} physics.impl={impl} num_envs={num_envs} num_timesteps={12 * 32 * num_envs} "
+        f"{task} warp {num_envs}",
+        f"env={task} physics.impl=warp num_envs={num_envs} num_timesteps={12 * 32 * num_envs} "
         f"{_NO_CHECKPOINTS}",
     )
 
@@ -181,15 +181,12 @@ SUITES = MappingProxyType(
         "sac-2gpu": (_sac(1, 32768), _sac(2, 16384), _sac(2, 32768)),
         # Trainers among their simulators, and in GMIs of their own.
         **{f"templates-{task}": _templates(task) for task in ("ant", "humanoid")},
-        # Every task, both implementations of MJX, one GMI; of two tasks other sizes too.
-        **{
-            f"tasks-{impl}": tuple(
-                _throughput(task, impl, num_envs)
-                for num_envs in (512, 2048, 8192, 32768)
-                for task in (TASKS if num_envs == 8192 else ("ant", "humanoid"))
-            )
-            for impl in ("jax", "warp")
-        },
+        # Every task, one GMI; of two tasks other sizes too.
+        "tasks-warp": tuple(
+            _throughput(task, num_envs)
+            for num_envs in (512, 2048, 8192, 32768)
+            for task in (TASKS if num_envs == 8192 else ("ant", "humanoid"))
+        ),
         # Figure 9.
         "reward": tuple(_reward(task, gmis) for task in REWARD for gmis in (1, 4)),
         **{f"lgr-{task}": _lgr(task) for task in ("ant", "humanoid", "shadow_hand")},

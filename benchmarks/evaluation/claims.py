@@ -9,18 +9,16 @@ from __future__ import annotations
 
 from benchmarks.cases import REWARD
 from benchmarks.evaluation.async_tables import KEYS, LONG, learners_over_one
-from benchmarks.evaluation.evidence import Evidence, Ratio, Said, joined
+from benchmarks.evaluation.evidence import Ratio, Said, joined
 from benchmarks.evaluation.figures import (
     TRAINING,
     ratio,
-    results_of,
     said,
     said_bounds,
-    sources_of,
 )
 from benchmarks.evaluation.learning_tables import seconds_over_one_process
 from benchmarks.evaluation.node_tables import two_nodes_over_one
-from benchmarks.evaluation.other_tables import USE, model_fit, searched
+from benchmarks.evaluation.other_tables import model_fit, searched
 from benchmarks.evaluation.paper import LGR, lgr_gain
 from benchmarks.evaluation.peer_tables import our_rate
 from benchmarks.evaluation.serving_tables import (
@@ -47,7 +45,6 @@ from benchmarks.evaluation.writer import Values, words
 def claims() -> Values:
     """What both versions of the paper claim, and what was measured here."""
     return {
-        "busy": _busy_stages(),
         "busy_one": said_bounds(busy_in_jobs(several=False), ".0%"),
         "busy_several": said_bounds(busy_in_jobs(several=True), ".0%"),
         "model_fit": model_fit(),
@@ -76,21 +73,12 @@ def _named(name: str, gain: Ratio | None) -> Said:
     return Said(f"{name} {found}", found.evidence)
 
 
-def _busy_stages() -> Said:
-    """SMs that the stages of one process keep busy, each measured once."""
-    uses = results_of(USE).get("tasks", {})
-    evidence = Evidence(1, frozenset(sources_of(USE)))
-    busy = [Ratio(stage["sm"], evidence) for use in uses.values() for stage in use.values()]
-    return said_bounds(busy, ".0%")
-
-
 def _more_environments(few: int, many: int, key: str = TRAINING) -> Said:
     """Steps/s, or memory, with many environments in one process over those with few."""
     return said_bounds(
         [
-            ratio(f"tasks-{impl}", f"{task} {impl} {many}", f"{task} {impl} {few}", key)
+            ratio("tasks-warp", f"{task} warp {many}", f"{task} warp {few}", key)
             for task in ("ant", "humanoid")
-            for impl in ("jax", "warp")
         ]
     )
 

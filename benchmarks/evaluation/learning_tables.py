@@ -172,18 +172,16 @@ def _last_return(curve: Curve, counts: Callable[[int, float], bool]) -> float | 
 
 @table(
     "throughput",
-    "task | environments: | MJX | simulation: | with inference: | with training:",
-    *("tasks-jax", "tasks-warp"),
+    "task | environments: | simulation: | with inference: | with training:",
+    "tasks-warp",
 )
 def throughput() -> Rows:
-    """Steps/s of every task, size and implementation."""
+    """Steps/s of every task and size."""
     for task in TASKS:
         for envs in (2048, 8192, 32768):
-            for impl in ("jax", "warp"):
-                found = [rate(f"tasks-{impl}", f"{task} {impl} {envs}", key) for key in RATES]
-                if all(found):
-                    cells = (shown(one, ",.0f") for one in found)
-                    yield [f"`{task}`", f"{envs:,}", impl, *cells]
+            found = [rate("tasks-warp", f"{task} warp {envs}", key) for key in RATES]
+            if all(found):
+                yield [f"`{task}`", f"{envs:,}", *(shown(one, ",.0f") for one in found)]
 
 
 def _kind_of_walking(call: Call) -> tuple[str, str, str | None, bool]:

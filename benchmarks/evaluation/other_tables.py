@@ -26,18 +26,6 @@ from benchmarks.evaluation.writer import (
 )
 from benchmarks.records import RESULTS, Call, calls_by_date, read_calls
 
-USE = "resource-use-nvidia-h200"
-
-
-@table("resource-use", "task | stage | time in an iteration, ms: | SMs busy: | memory:", USE)
-def resource_use() -> Rows:
-    """What the tasks of an iteration take of a GPU."""
-    for task, uses in results_of(USE).get("tasks", {}).items():
-        for stage in ("simulator", "agent", "trainer"):
-            use = uses[stage]
-            cells = [f"{1e3 * use['seconds']:.2f}", f"{use['sm']:.0%}", f"{use['memory']:.2%}"]
-            yield [f"`{task}`", stage, *cells]
-
 
 def _searches() -> Calls:
     """By task, the newest call that searched it."""
@@ -155,7 +143,7 @@ def seconds_to_recover() -> dict[str, Figure | None]:
 
 @table(
     "faults-cpu",
-    "faults of | kinds: | faults: | unexpected: | lost: | leaked: | seconds a fault:",
+    "faults of | kinds: | unexpected: | lost: | leaked: | seconds a fault:",
     "faults-cpu",
 )
 def faults_on_a_cpu() -> Rows:
@@ -167,9 +155,10 @@ def faults_on_a_cpu() -> Rows:
         trials = {row["trial"]: row for row in found}.values()  # One may have several faults.
         unexpected = sum(row["outcome"] != "as wanted" for row in found)
         sums = (sum(len(row[what]) for row in trials) for what in ("lost", "leaked"))
+        counts = (f"{count} of {len(found)}" for count in (unexpected, *sums))
         seconds = shown(figure([row["seconds"] for row in found]), ".0f")
         kinds = len({row["kind"] for row in found})
-        yield [group, *map(str, (kinds, len(found), unexpected, *sums)), seconds]
+        yield [group, str(kinds), *counts, seconds]
 
 
 def _rows_of_faults() -> Iterator[Mapping[str, Any]]:
@@ -179,17 +168,3 @@ def _rows_of_faults() -> Iterator[Mapping[str, Any]]:
     for call in (one for one in calls if one.commit == calls[-1].commit):
         for row in call.results.get("rows", ()):
             yield {**row, "trial": (call.date, row["trial"])}
-
-
-@table(
-    "sm-shares",
-    "cap, %: | SMs: | products | TFLOP/s bfloat16: | TFLOP/s TF32:",
-    "sm-shares-nvidia-h200",
-)
-def sm_shares() -> Rows:
-    """At which caps on SMs half-precision products were right."""
-    for row in results_of("sm-shares-nvidia-h200").get("rows", ()):
-        wrong = {p["library"] for p in row["products"] if p["wrong"]}
-        verdict = f"**wrong** ({', '.join(sorted(wrong))})" if wrong else "right"
-        rates = [f"{value:.0f}" for value in row["tflops"].values()]
-        yield [f"{row['sm_percent']:g}", str(row["num_sms"]), verdict, *rates]

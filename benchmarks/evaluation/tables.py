@@ -278,15 +278,14 @@ def lgr() -> Rows:
 
 @table(
     "num-env",
-    "task | environments: | MJX | steps/s: | memory, MiB:",
-    *("tasks-jax", "tasks-warp"),
+    "task | environments: | steps/s: | memory, MiB:",
+    "tasks-warp",
 )
 def num_env() -> Rows:
     """Throughput and memory over environments, one GMI."""
     for task in ("ant", "humanoid"):
-        for impl in ("jax", "warp"):
-            for envs in (512, 2048, 8192, 32768):
-                name, file = f"{task} {impl} {envs}", f"tasks-{impl}"
-                found = rate(file, name), rate(file, name, "device/peak_memory_mib")
-                if all(found):
-                    yield [f"`{task}`", f"{envs:,}", impl, *(shown(one, ",.0f") for one in found)]
+        for envs in (512, 2048, 8192, 32768):
+            name = f"{task} warp {envs}"
+            found = rate("tasks-warp", name), rate("tasks-warp", name, "device/peak_memory_mib")
+            if all(found):
+                yield [f"`{task}`", f"{envs:,}", *(shown(one, ",.0f") for one in found)]

@@ -68,12 +68,8 @@ COMPARISONS: Mapping[str, Comparison] = MappingProxyType(
     {
         # With the settings of `configs/tuned/`.
         "ant, MJX-Warp": Comparison(("env=ant", "physics.impl=warp", "num_timesteps=20000000")),
-        "ant, MJX-JAX": Comparison(("env=ant", "physics.impl=jax", "num_timesteps=15000000")),
         "humanoid, MJX-Warp": Comparison(
             ("env=humanoid", "physics.impl=warp", "num_timesteps=10000000")
-        ),
-        "humanoid, MJX-JAX": Comparison(
-            ("env=humanoid", "physics.impl=jax", "num_timesteps=5000000")
         ),
         # Settings of the notebook that comes with Brax (notebooks/training.ipynb).
         "Brax's ant": Comparison(

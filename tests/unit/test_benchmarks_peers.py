@@ -164,7 +164,7 @@ def test_flags_of_fast_td3_are_words():
 
 
 def test_overrides_change_both_sides_and_bad_ones_are_told():
-    side = Side("ant, MJX-JAX", BRAX, ("num_envs=512", "algo.learning_rate_schedule=fixed"))
+    side = Side("ant, MJX-Warp", BRAX, ("num_envs=512", "algo.learning_rate_schedule=fixed"))
     assert side.told["arguments"]["batch_size"] == 128
     assert side.told["arguments"]["learning_rate_schedule"] == "NONE"
     assert side._replace(trainer=OURS).told.endswith("algo.learning_rate_schedule=fixed")
@@ -175,7 +175,7 @@ def test_overrides_change_both_sides_and_bad_ones_are_told():
     with pytest.raises(ConfigError, match="--only 'cat': in no name"):
         list(peers.wanted_sides(["ant", "cat"], ()))
     with pytest.raises(ConfigError, match="num_env"):
-        list(peers.wanted_sides(["ant, MJX-JAX"], ("num_env=3",)))
+        list(peers.wanted_sides(["Brax's ant"], ("num_env=3",)))
 
 
 def test_what_lacks_a_package_is_left_out(
@@ -286,8 +286,8 @@ def benchmark(
 
 def test_both_sides_run_in_turn_and_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     # A minute to compile, then the two sides in turn; the sixth training would end at 420 s.
-    made = benchmark(monkeypatch, tmp_path, Fake(), "ant, MJX-JAX", deadline_s=400.0)
-    runs = [made.file.results["cases"][f"ant, MJX-JAX, {one}"]["runs"] for one in (OURS, BRAX)]
+    made = benchmark(monkeypatch, tmp_path, Fake(), "Brax's ant", deadline_s=400.0)
+    runs = [made.file.results["cases"][f"Brax's ant, {one}"]["runs"] for one in (OURS, BRAX)]
     assert [[run["repeat"] for run in own] for own in runs] == [[0, 1, 2], [0, 1]]
     rates = [own[0]["summary"]["steps_per_s"] for own in runs]
     assert rates == pytest.approx([200.0, 100.0])
@@ -300,10 +300,10 @@ def test_both_sides_run_in_turn_and_are_kept(tmp_path: Path, monkeypatch: pytest
 
 
 def test_what_does_not_compile_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made = benchmark(monkeypatch, tmp_path, Fake("brax_ppo"), "ant, MJX-JAX", repeats=2)
+    made = benchmark(monkeypatch, tmp_path, Fake("brax_ppo"), "Brax's ant", repeats=2)
     cases = made.file.results["cases"]
-    assert cases["ant, MJX-JAX, Brax"]["runs"] == [{"repeat": 0, "failed": "no such task"}]
-    assert len(cases["ant, MJX-JAX, gmijax"]["runs"]) == 2
+    assert cases["Brax's ant, Brax"]["runs"] == [{"repeat": 0, "failed": "no such task"}]
+    assert len(cases["Brax's ant, gmijax"]["runs"]) == 2
     assert made.has_failed
 
 
@@ -312,12 +312,12 @@ def test_the_table_takes_the_newest_call_that_measured_both_sides(
 ):
     monkeypatch.setattr(records, "RESULTS", tmp_path)
     assert TABLES["peers"]() == [NOT_MEASURED]
-    made = benchmark(monkeypatch, tmp_path, Fake(), "ant, MJX-JAX", repeats=1)
-    benchmark(monkeypatch, tmp_path / "2", Fake("gmijax.train"), "ant, MJX-JAX", repeats=1)
+    made = benchmark(monkeypatch, tmp_path, Fake(), "Brax's ant", repeats=1)
+    benchmark(monkeypatch, tmp_path / "2", Fake("gmijax.train"), "Brax's ant", repeats=1)
     calls = [json.loads(made.file.path.read_text())["calls"][0]]
     calls += json.loads((tmp_path / "2" / made.file.path.name).read_text())["calls"]
     path = tmp_path / "peers-nvidia-h200.json"
     path.write_text(json.dumps({"format": 2, "suite": "peers", "calls": calls}))
     table = TABLES["peers"]()
-    assert "| ant, MJX-JAX | Brax | 200 | 100 | 2.00 | 60.0 | 60.0 |" in table
+    assert "| Brax's ant | Brax | 200 | 100 | 2.00 | 60.0 | 60.0 |" in table
     assert sum(NOT_MEASURED in line for line in table) == len(COMPARISONS) - 1

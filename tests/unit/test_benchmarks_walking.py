@@ -236,30 +236,32 @@ def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypat
     monkeypatch.setattr(records, "RESULTS", tmp_path)
     assert TABLES["walking"]() == [NOT_MEASURED]
     row = {"seeds": 5, "walk": 5, "env_steps": [4e7, 5e7, 6e7]}
-    sac = ["env=go1", "algo=sac"]
+    by_sac = ["env=go1", "algo=sac"]
     for is_cold, seconds, given, task in (
         # Playground's name is the same robot's.
         (False, 99.0, [], "playground/Go1JoystickFlatTerrain"),
         (False, 60.0, ["env=go1"], "go1"),
         (True, 100.0, [], "go1"),
-        (False, 70.0, sac, "playground/Go1JoystickFlatTerrain"),
+        (False, 70.0, by_sac, "playground/Go1JoystickFlatTerrain"),
     ):
         path = tmp_path / "walking-go1-nvidia-h100.json"
         settings = {"cold": is_cold, "overrides": given}
         file = ResultsFile(path, "walking", settings, device="H100")
         spread = {"training_s": [50.0, seconds, 120.0], "command_s": None}
         errors = {"linear_m_per_s": seconds / 1000, "yaw_rad_per_s": None}
-        tested = {"env_steps": 7e7, "walk": {"upright": 0.995, "settled": errors}}
+        walk = {"upright": 0.995, "settled": errors, "impl": "warp"}
+        tested = {"env_steps": 7e7, "walk": walk}
         runs = [{"trainer": "gmijax", "checkpoints": [tested, {"env_steps": 8e7}]}] * 5
         with file.changing() as results:
             results.update(task=task, rows={"gmijax": row | spread}, runs=runs)
     lines = TABLES["walking"]()
     rows = [line for line in lines if line.startswith("| `")]
     walk, share, most = "5 of 5 | 50 (40 to 60)", "70 | 99.5%", "(50 to 120)"
+    ppo, sac, cached = "`go1` | warp | gmijax PPO", "`go1` | warp | gmijax SAC", "from the cache"
     assert rows == [
-        f"| `go1` | gmijax PPO | from the cache | {walk} | 60 {most} |  | {share} | 0.06 |  |",
-        f"| `go1` | gmijax PPO | compiled anew | {walk} | 100 {most} |  | {share} | 0.10 |  |",
-        f"| `go1` | gmijax SAC | from the cache | {walk} | 70 {most} |  | {share} | 0.07 |  |",
+        f"| {ppo} | {cached} | {walk} | 60 {most} |  | {share} | 0.06 |  |",
+        f"| {ppo} | compiled anew | {walk} | 100 {most} |  | {share} | 0.10 |  |",
+        f"| {sac} | {cached} | {walk} | 70 {most} |  | {share} | 0.07 |  |",
     ]
 
 

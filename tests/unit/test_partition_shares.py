@@ -14,7 +14,7 @@ from gmijax.errors import ConfigError
 from gmijax.partition.plan import Plan
 from gmijax.partition.shares import is_clean
 
-MEASURED = Path(__file__).parents[2] / "benchmarks/results/sm-shares-nvidia-h200.json"
+MEASURED = Path(__file__).parents[2] / "tests/golden/sm_caps_h200.json"
 AMPERE = (gpu(0)._replace(compute_capability=(8, 0)),)
 
 

@@ -16,7 +16,7 @@ from gmijax import selfcheck
 from gmijax.errors import SelfCheckFailed
 from gmijax.selfcheck import PRECISIONS, SIZES, Precision, check_share, compare_products
 
-MEASURED = Path(__file__).parents[2] / "benchmarks/results/sm-shares-nvidia-h200.json"
+MEASURED = Path(__file__).parents[2] / "tests/golden/sm_caps_h200.json"
 RIGHT = selfcheck.multiply
 SMALL = ((64, 128, 32), (32, 64, 96))
 
