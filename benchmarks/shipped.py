@@ -38,10 +38,10 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.player.policy import read_policy, write_policy
 from gmijax.player.returns import Played, play
 from gmijax.player.shipped import POLICIES
+from gmijax.runs.checkpoints import CheckpointMeta, newest_checkpoint
 from gmijax.runs.folder import POLICY, RunPaths, read_json
 from gmijax.runs.history import read_metrics
 from gmijax.runs.ranking import best_checkpoint
-from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
 from gmijax.sweeps.sweep import sweep
 
 SEED = 0

@@ -44,9 +44,9 @@ from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.player.joystick import robot_of
 from gmijax.player.walking import LEAST_ENVS, NUM_ENVS
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.history import read_metrics
-from gmijax.runs.resume import CheckpointMeta, checkpoints_of
 from gmijax.sim.robots import playground_name, robot_name
 
 OURS, SCRIPT = "gmijax", "train-jax-ppo"

@@ -25,8 +25,8 @@ from gmijax.errors import ConfigError
 from gmijax.learning.walking import Act, WalkingTest, walking_env
 from gmijax.player.joystick import robot_of
 from gmijax.player.policy import read_policy
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import POLICY, read_json, write_json
-from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim.impl import choose_impl, impl_of_policy
 from gmijax.sim.interface import Env
 from gmijax.sim.robots import changed_settings

@@ -11,8 +11,8 @@ from gmijax.config import ALGORITHMS
 from gmijax.config.schema import to_dict
 from gmijax.player.plain_env import PlainEnv
 from gmijax.player.policy import PlainPolicy, write_policy
+from gmijax.runs.checkpoints import CheckpointMeta, file_check
 from gmijax.runs.folder import META, POLICY, RunPaths, write_json
-from gmijax.runs.resume import CheckpointMeta, file_check
 
 
 def make_plain_run(root: Path, *env_steps: int, task: str = "ball_balance") -> RunPaths:

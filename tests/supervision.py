@@ -14,8 +14,8 @@ from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import META, RunPaths, write_json
-from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.start_gmi import Launch

@@ -12,8 +12,9 @@ from gmijax.cli.help import allowed_values, topics_of
 from gmijax.cli.pack import PackKeys
 from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig, ViewConfig
 from gmijax.errors import GmijaxError
+from gmijax.runs.checkpoints import checkpoints_of
 from gmijax.runs.folder import RUNS
-from gmijax.runs.resume import checkpoints_of, find_checkpoint
+from gmijax.runs.resume import find_checkpoint
 
 COMMANDS: Final[Mapping[str, type[Any]]] = {
     "train": TrainConfig,

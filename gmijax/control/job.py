@@ -46,11 +46,11 @@ from gmijax.control.wandb_link import followed, require_wandb
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.compile_times import CompileTime
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
 from gmijax.runs.held import OpenFolder, is_locked
 from gmijax.runs.history import MetricsReader, copy_history
-from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import training_kind
 from gmijax.supervise.run_gmis import Launch, recorded

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 from gmijax.control.run_folder import clear_unfinished, keep_logs
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, JobInterrupted
+from gmijax.runs.checkpoints import CheckpointMeta, newest_checkpoint
 from gmijax.runs.folder import RunPaths, add_event
-from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
 from gmijax.supervise.run_gmis import Launch, OnTick, run_gmis
 from gmijax.supervise.stop_signals import StopSignals, stop_signals
 from gmijax.supervise.watched_gmi import GmiStatus

@@ -16,6 +16,7 @@ from gmijax.control.console import nearby
 from gmijax.control.start_point import StartPoint, has_trained
 from gmijax.control.summary import train_summary
 from gmijax.partition.plan import Plan
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of, drop_unfinished
 from gmijax.runs.folder import (
     RunPaths,
     add_event,
@@ -28,12 +29,7 @@ from gmijax.runs.git import record_git
 from gmijax.runs.held import OpenFolder, gone_if_unused, locked
 from gmijax.runs.history import copy_history, draw_returns
 from gmijax.runs.names import attempt_folders, gmi_folders
-from gmijax.runs.resume import (
-    CheckpointMeta,
-    checkpoints_of,
-    choose_checkpoint,
-    drop_unfinished,
-)
+from gmijax.runs.resume import choose_checkpoint
 from gmijax.runs.saved_config import saved_config
 from gmijax.sim import source
 

@@ -14,9 +14,9 @@ from gmijax.control.display import clock
 from gmijax.control.summary import Data, own_versions, plan_data
 from gmijax.learning.physics_health import overflow_warnings
 from gmijax.partition.plan import Plan
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
-from gmijax.runs.resume import CheckpointMeta
 
 
 def serve_summary(

@@ -29,6 +29,7 @@ from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import SIMULATOR, group_of
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.compile_times import CompileTime
 from gmijax.runs.dataset import DataPaths, open_dataset
 from gmijax.runs.folder import (
@@ -40,7 +41,7 @@ from gmijax.runs.folder import (
 )
 from gmijax.runs.held import OpenFolder, gone_if_unused, locked
 from gmijax.runs.history import MetricsReader, read_metrics
-from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, find_checkpoint, is_training
+from gmijax.runs.resume import choose_checkpoint, find_checkpoint, is_training
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import serving_kind

@@ -11,6 +11,7 @@ from gmijax.config import EnvConfig, TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
 from gmijax.partition.plan import Plan
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of, newest_checkpoint
 from gmijax.runs.folder import (
     NO_RUN_FOLDER,
     RUNS,
@@ -24,12 +25,7 @@ from gmijax.runs.folder import (
 )
 from gmijax.runs.history import read_metrics
 from gmijax.runs.names import nearby
-from gmijax.runs.resume import (
-    CheckpointMeta,
-    checkpoints_of,
-    choose_checkpoint,
-    newest_checkpoint,
-)
+from gmijax.runs.resume import choose_checkpoint
 from gmijax.runs.saved_config import (
     differences,
     require_known_keys,

@@ -13,12 +13,12 @@ from gmijax.control.console import nearby
 from gmijax.control.display import clock
 from gmijax.learning.physics_health import overflow_warnings
 from gmijax.partition.plan import Plan
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
 from gmijax.runs.names import by_steps
 from gmijax.runs.ranking import best_checkpoint
 from gmijax.runs.result import TrainResult
-from gmijax.runs.resume import CheckpointMeta, checkpoints_of
 from gmijax.version import __version__, versions_of
 
 _VERSIONS = ("jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")

@@ -15,7 +15,7 @@ from gmijax.learning.checkpoint import learner_sizes
 from gmijax.learning.learner import acting_weights, make_learner
 from gmijax.learning.normalize import OBS_CLIP, Moments, normalize, std_of
 from gmijax.learning.start import saved_state
-from gmijax.runs.resume import CheckpointMeta
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.saved_config import trained_config
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array

@@ -12,17 +12,11 @@ from gmijax.config import EnvConfig, ExportConfig, PlayConfig, ViewConfig
 from gmijax.config.schema import to_dict
 from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of
 from gmijax.runs.folder import META, RunPaths, remove_temporary, write_json
 from gmijax.runs.names import steps_name
 from gmijax.runs.ranking import best_checkpoint, ranked
-from gmijax.runs.resume import (
-    CheckpointMeta,
-    checkpoints_of,
-    find_checkpoint,
-    first_checkpoint_of,
-    newer_than,
-    unsaved_runs,
-)
+from gmijax.runs.resume import find_checkpoint, first_checkpoint_of, newer_than, unsaved_runs
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
 from gmijax.sim.registry import require_env, require_own

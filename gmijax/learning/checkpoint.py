@@ -28,8 +28,8 @@ from gmijax.errors import ConfigError, NonFiniteError, ParameterMismatch
 from gmijax.learning import saved_arrays
 from gmijax.learning.episode_window import Standing
 from gmijax.learning.kept_checkpoints import keep_best, keep_last_replays, remove
+from gmijax.runs.checkpoints import CheckpointMeta, file_check
 from gmijax.runs.folder import META, RunPaths, read_json, replay_name, replays_of, write_json
-from gmijax.runs.resume import CheckpointMeta, file_check
 from gmijax.types import PyTree
 
 T = TypeVar("T")

@@ -15,8 +15,8 @@ import numpy as np
 from gmijax.collectives.interface import Communicator
 from gmijax.learning.checkpoint import finish_checkpoint, save_envs, save_learner, save_replay
 from gmijax.learning.report_thread import ReportThread
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import RunPaths
-from gmijax.runs.resume import CheckpointMeta
 from gmijax.types import PyTree
 
 

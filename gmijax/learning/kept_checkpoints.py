@@ -7,9 +7,9 @@ import os
 import shutil
 from pathlib import Path
 
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of
 from gmijax.runs.folder import META, RunPaths, replays_of, write_json
 from gmijax.runs.ranking import ranked
-from gmijax.runs.resume import CheckpointMeta, checkpoints_of
 
 
 def keep_best(paths: RunPaths, keep: int, last: Path) -> None:

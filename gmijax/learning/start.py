@@ -25,7 +25,7 @@ from gmijax.learning.checkpoint import (
 from gmijax.learning.episode_window import EpisodeWindow
 from gmijax.learning.learner import Learner, TrainState, init_learner
 from gmijax.machine.host_limits import detect_host
-from gmijax.runs.resume import CheckpointMeta
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.saved_config import saved_config
 from gmijax.sim.interface import Env
 from gmijax.sim.randomize import make_envs

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmijax.errors import ConfigError
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of, what_is_broken
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.history import number_in, read_metrics
-from gmijax.runs.resume import CheckpointMeta, checkpoints_of, what_is_broken
 
 
 class Rank(NamedTuple):

@@ -1,165 +1,31 @@
-"""Finding a checkpoint and checking that it is whole and fits, without loading it."""
+"""Which checkpoint is meant: that of a folder, the newest of a run, or the last run's."""
 
 from __future__ import annotations
 
 import difflib
-import hashlib
-import json
 import os
-import shutil
-import zlib
-from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final
 
-from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError, NoCheckpointYet
+from gmijax.runs.checkpoints import (
+    CheckpointMeta,
+    checkpoints_of,
+    newest_checkpoint,
+    what_is_broken,
+)
 from gmijax.runs.folder import (
     META,
-    REMOVED,
     RUNS,
-    UNFINISHED,
     RunPaths,
-    open_regular,
     read_json,
 )
 from gmijax.runs.held import is_locked
-from gmijax.runs.names import by_steps, nearby, steps_name, steps_of
-
-_CHUNK_BYTES: Final = 1 << 20
-
-_DIGEST: Final = "sha256"
-"""Key of `meta.json`."""
+from gmijax.runs.names import nearby
 
 _MOST_NAMED: Final = 5
 """Runs that one line names."""
-
-
-@dataclass(frozen=True)
-class CheckpointMeta:
-    """Meta data of a checkpoint."""
-
-    env: str  # Task name.
-    algo: str  # Training algorithm.
-    env_steps: int  # Environment steps of the whole job so far.
-    num_gmis: int  # K of the job that wrote it.
-    num_envs: int  # N of that job, environments per GMI.
-    # Widths of the policy and of the value network.
-    hidden: tuple[tuple[int, ...], tuple[int, ...]]
-    impl: str  # Physics implementation; environment states of one cannot be used by the other.
-    # Of the latest episodes before it (`EpisodeWindow`), None while none had ended.
-    mean_return: float | None = None
-    # Of the evaluation at `env_steps`, None if there was none.
-    eval_return: float | None = None
-    # Whether `mean_return` is over enough episodes; not known of older versions.
-    window_full: bool = False
-    # A time limit of all its environments together, in environment steps; None: not known.
-    limit_steps: float | None = None
-    # As the run was told, that of the schedule is in the learner's state.
-    learning_rate: float | None = None
-    # When it was written, seconds since 1970: files get new times when a run is copied.
-    time_s: float | None = None
-    # Size in bytes and CRC-32 of every other file, by its path in the checkpoint; empty in
-    # those of older versions.
-    files: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, object]:
-        """Plain data for `meta.json`, with a digest of all the rest."""
-        data = asdict(self)
-        return {**data, _DIGEST: _digest(data)}
-
-    @classmethod
-    def read(cls, checkpoint: Path) -> CheckpointMeta:
-        """Reads the meta data of a checkpoint folder.
-
-        Raises:
-          ConfigError: they are not those of a checkpoint.
-        """
-        try:
-            data = read_json(checkpoint / META)
-            # Those of older versions have none.
-            noted = data.pop(_DIGEST, None)
-            if noted not in (None, _digest(data)):
-                raise ConfigError("not as it was written")
-            return from_dict(cls, data)
-        except ConfigError as error:
-            why = str(error).removeprefix(f"{checkpoint / META}: ")
-            raise ConfigError(f"checkpoint {checkpoint}: broken {META} ({why})") from None
-
-
-def _digest(data: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
-
-
-class NewestCheckpoint(NamedTuple):
-    """Checkpoints of a run folder."""
-
-    checkpoint: Path | None  # The newest one that is whole, None if there is none.
-    passed_over: tuple[str, ...]  # Newer ones, each with what is wrong with it.
-
-
-def checkpoints_of(folder: Path) -> list[Path]:
-    """The checkpoints of a run folder, whole or not, the fewest steps first.
-
-    What has another name than gmijax gives is somebody's copy, and none of them.
-    """
-    found = by_steps(RunPaths(folder).checkpoints)
-    return [path for path in found if os.path.lexists(path / META)]
-
-
-def drop_unfinished(run: RunPaths) -> None:
-    """Removes what is left of checkpoints that were being written or removed."""
-    for suffix in (UNFINISHED, REMOVED):
-        for hidden in by_steps(run.checkpoints, prefix=".", suffix=suffix):
-            shutil.rmtree(hidden, ignore_errors=True)
-
-
-def newest_checkpoint(folder: Path) -> NewestCheckpoint:
-    """The newest checkpoint of a run folder whose files are as they were written."""
-    passed_over: list[str] = []
-    for checkpoint in reversed(checkpoints_of(folder)):
-        wrong = what_is_broken(checkpoint)
-        if wrong is None:
-            return NewestCheckpoint(checkpoint.resolve(), tuple(passed_over))
-        passed_over.append(f"checkpoint {checkpoint}: passed over, {wrong}")
-    return NewestCheckpoint(None, tuple(passed_over))
-
-
-def what_is_broken(checkpoint: Path) -> str | None:
-    """Why a checkpoint cannot be used, None if its files are as they were written."""
-    try:
-        meta = CheckpointMeta.read(checkpoint)
-    except ConfigError as error:
-        return str(error).removeprefix(f"checkpoint {checkpoint}: ")
-    if steps_of(checkpoint.name) not in (None, meta.env_steps):  # A copy under such a name.
-        return f"{META} is that of {steps_name(meta.env_steps)}"
-    return next(
-        filter(None, (_broken_file(checkpoint, *item) for item in meta.files.items())), None
-    )
-
-
-def _broken_file(checkpoint: Path, name: str, wanted: tuple[int, ...]) -> str | None:
-    try:
-        real = os.path.realpath(checkpoint / name)
-        if not Path(real).is_relative_to(os.path.realpath(checkpoint)):
-            return f"{name} is not a file of it"
-        is_same = file_check(Path(real)) == tuple(wanted)
-    except OSError as error:
-        return f"{name}: {error.strerror}"
-    except ValueError as error:  # No name that a file can have.
-        return f"{name!r}: {error}"
-    return None if is_same else f"{name} is not as it was written"
-
-
-def file_check(path: Path) -> tuple[int, int]:
-    """Size in bytes and CRC-32 of a regular file; raises OSError for anything else."""
-    size = crc = 0
-    with open_regular(path) as file:
-        while chunk := file.read(_CHUNK_BYTES):
-            size, crc = size + len(chunk), zlib.crc32(chunk, crc)
-    return size, crc
 
 
 def find_checkpoint(wanted: str, key: str) -> Path:

@@ -9,9 +9,9 @@ from typing import NamedTuple
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.start_point import find_start_point
 from gmijax.errors import ConfigError
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.held import is_locked
-from gmijax.runs.resume import CheckpointMeta
 from gmijax.sweeps.jobs import Job, started_in, state_of
 from gmijax.sweeps.paths import SweepPaths
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from gmijax.errors import ConfigError
 from gmijax.player.policy import PlainPolicy, checkpoint_policy
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of
 from gmijax.runs.folder import META, POLICY
 from gmijax.runs.names import steps_of
-from gmijax.runs.resume import CheckpointMeta, checkpoints_of
 
 
 class Checkpoints:

@@ -16,8 +16,8 @@ from gmijax.control.console import nearby
 from gmijax.player.joystick import Robot, robot_of
 from gmijax.player.outcome import Episodes, summarise
 from gmijax.player.walking import NUM_ENVS
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import PlayPaths, read_json, write_json
-from gmijax.runs.resume import CheckpointMeta
 from gmijax.runs.saved_config import trained_config
 from gmijax.supervise.child import ChildLink, run_gmi
 

@@ -29,8 +29,8 @@ from gmijax.config import ALGORITHMS
 from gmijax.config.schema import to_dict
 from gmijax.player.plain_env import PlainEnv
 from gmijax.player.policy import write_policy
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import META, POLICY, RunPaths, write_json
-from gmijax.runs.resume import CheckpointMeta
 
 _MORE = os.environ.get("GMIJAX_FUZZ_EXAMPLES")
 _SEED = int(os.environ.get("GMIJAX_FUZZ_SEED", random.randrange(2**32) if _MORE else 0))

@@ -12,7 +12,7 @@ import pytest
 from command_lines import run as run_here
 from training_jobs import POINT, learner_arrays, train
 
-from gmijax.runs.resume import what_is_broken
+from gmijax.runs.checkpoints import what_is_broken
 
 BASE = (
     *(POINT[0], "num_envs=16", "algo.unroll_length=4", "algo.policy_hidden_layer_sizes=[8]"),

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from training_jobs import FOREVER, POINT, POINT_TASK, STEPS, pids_of, start, train, wait_until
 
+from gmijax.runs.checkpoints import checkpoints_of
 from gmijax.runs.dataset import DataPaths
-from gmijax.runs.resume import checkpoints_of
 
 
 def moved(run: Path) -> None:

@@ -14,8 +14,8 @@ from training_jobs import POINT, STEPS, gmi_pid, kill, start, train, wait_until
 
 import gmijax
 from gmijax.learning.episode_window import WINDOW_EPISODES
+from gmijax.runs.checkpoints import newest_checkpoint
 from gmijax.runs.history import read_metrics
-from gmijax.runs.resume import newest_checkpoint
 
 ITERATIONS = 500
 """Of jobs that are killed and stopped before their end."""

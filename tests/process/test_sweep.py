@@ -17,7 +17,7 @@ from small_disk import can_mount, small_disk
 from sweep_neighbours import Neighbours
 from training_jobs import FOREVER, POINT, STEPS, start, train, wait_until
 
-from gmijax.runs.resume import newest_checkpoint
+from gmijax.runs.checkpoints import newest_checkpoint
 
 SWEEP = (
     *POINT,

@@ -33,8 +33,9 @@ from training_jobs import (
     wait_until,
 )
 
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.history import read_metrics
-from gmijax.runs.resume import CheckpointMeta, find_checkpoint
+from gmijax.runs.resume import find_checkpoint
 
 
 def _read(path: Path) -> dict[str, Any]:

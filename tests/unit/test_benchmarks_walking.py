@@ -25,8 +25,8 @@ from gmijax.errors import ConfigError
 from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.player.policy import PlainPolicy, write_policy
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import POLICY, RunPaths, read_json, write_json
-from gmijax.runs.resume import CheckpointMeta
 
 
 def checkpoints(*walks: bool | None) -> list[dict[str, Any]]:

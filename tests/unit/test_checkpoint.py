@@ -26,9 +26,9 @@ from gmijax.learning.checkpoint import (
 )
 from gmijax.learning.learner import TrainState, learner_shapes
 from gmijax.learning.saved_arrays import on_host
+from gmijax.runs.checkpoints import CheckpointMeta, newest_checkpoint
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.ranking import best_checkpoint, best_evaluation
-from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
 from gmijax.sim.interface import EnvSpec
 
 

@@ -18,17 +18,12 @@ from gmijax.control.summary import train_outcome
 from gmijax.deploy.trained_run import open_run
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.learning.checkpoint import finish_checkpoint
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of, newest_checkpoint
 from gmijax.runs.dataset import DataPaths
 from gmijax.runs.folder import META, RunPaths, write_json
 from gmijax.runs.names import attempt_folders, by_steps, gmi_folders, steps_name, steps_of
 from gmijax.runs.ranking import best_checkpoint, best_evaluation
-from gmijax.runs.resume import (
-    CheckpointMeta,
-    checkpoints_of,
-    choose_checkpoint,
-    last_run,
-    newest_checkpoint,
-)
+from gmijax.runs.resume import choose_checkpoint, last_run
 
 COPIES = (
     "2026-11-26-good",

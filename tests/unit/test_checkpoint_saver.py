@@ -14,8 +14,8 @@ from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.learning import checkpoint_saver
 from gmijax.learning.checkpoint import restore_envs
 from gmijax.learning.checkpoint_saver import CheckpointPart, CheckpointSaver
+from gmijax.runs.checkpoints import CheckpointMeta, newest_checkpoint
 from gmijax.runs.folder import RunPaths
-from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
 
 
 def part(folder: Path, env_steps: int, envs: Any = None) -> CheckpointPart:

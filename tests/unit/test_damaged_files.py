@@ -22,10 +22,10 @@ from gmijax.control.start_point import find_start_point
 from gmijax.control.summary import train_summary
 from gmijax.errors import ConfigError
 from gmijax.runs import folder
+from gmijax.runs.checkpoints import CheckpointMeta, file_check, newest_checkpoint, what_is_broken
 from gmijax.runs.folder import META, RunPaths, open_regular, read_json, write_json
 from gmijax.runs.held import locked
 from gmijax.runs.history import copy_history, read_metrics
-from gmijax.runs.resume import CheckpointMeta, file_check, newest_checkpoint, what_is_broken
 from gmijax.sweeps.jobs import state_of
 from gmijax.sweeps.progress import Progress
 

@@ -14,9 +14,9 @@ from gmijax.learning.checkpoint import checkpoint_meta, finish_checkpoint, save_
 from gmijax.learning.episode_window import WINDOW_EPISODES, EpisodeWindow, Standing
 from gmijax.learning.kept_checkpoints import remove
 from gmijax.learning.start import first_window
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.runs.ranking import best_checkpoint
-from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim.wrappers import EpisodeSums
 
 LIMIT, UNROLL = 200, 8

@@ -19,8 +19,8 @@ from gmijax.learning.checkpoint import (
     save_envs,
     save_learner,
 )
+from gmijax.runs.checkpoints import CheckpointMeta, newest_checkpoint
 from gmijax.runs.folder import RunPaths
-from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
 
 META = CheckpointMeta("ant", "ppo", 7, 1, 8, ((8,), (8,)), "jax")
 

@@ -21,8 +21,8 @@ from gmijax.control import job, restarts, serving
 from gmijax.deploy import exporting, playing
 from gmijax.deploy.viewing import view
 from gmijax.errors import ConfigError
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import RunPaths, read_json, write_json
-from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim import source
 from gmijax.sim.adapters import custom
 from gmijax.sim.registry import make_env

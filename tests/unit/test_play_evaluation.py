@@ -22,9 +22,9 @@ from gmijax.learning.walking import walking_env
 from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.player.joystick import ROBOTS
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import EXIT_NO_GL, META, PlayPaths, RunPaths, write_json
 from gmijax.runs.held import locked
-from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.start_gmi import environment_of
 
 

@@ -17,17 +17,10 @@ from gmijax.cli.compose import compose
 from gmijax.config import PpoConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, NoCheckpointYet
+from gmijax.runs.checkpoints import CheckpointMeta, file_check, newest_checkpoint
 from gmijax.runs.folder import META, RunPaths, read_json, write_json
 from gmijax.runs.held import locked
-from gmijax.runs.resume import (
-    CheckpointMeta,
-    choose_checkpoint,
-    file_check,
-    find_checkpoint,
-    last_run,
-    newest_checkpoint,
-    unsaved_runs,
-)
+from gmijax.runs.resume import choose_checkpoint, find_checkpoint, last_run, unsaved_runs
 from gmijax.runs.saved_config import left_out, trained_config
 
 

@@ -22,8 +22,8 @@ from gmijax.control.start_point import (
     require_replay_fits,
 )
 from gmijax.errors import ConfigError
+from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import META, RunPaths, create_run, read_json, write_json
-from gmijax.runs.resume import CheckpointMeta
 
 
 def config_of(folder: Path, *overrides: str) -> TrainConfig:
