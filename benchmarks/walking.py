@@ -13,7 +13,7 @@ With `--gpus` seeds are trained and tested at the same time, each on a GPU of it
 of the cores.
 
 `--script` trains with Playground's own script (Brax's PPO) too, in turn with ours, with its own
-settings but for these flags, with the last `--script-seeds` of the seeds. Its short training has
+settings but for these flags, with the first `--script-seeds` of the seeds. Its short training has
 as many steps as it makes between two evaluations: their number is part of its program. Adds a call
 to `benchmarks/results/walking-<task>-<device>.json`.
 """
@@ -92,7 +92,7 @@ class Benchmark:
         mine: list[dict[str, Any]] = []
         for number, trainer in in_turn(trainers, len(seeds), self._trained_by_s):
             seed = seeds[number]
-            if trainer == SCRIPT and seed < self._given.seeds - self._script_seeds:
+            if trainer == SCRIPT and seed >= self._script_seeds:
                 continue
             run = {"trainer": trainer, "seed": seed, **self._train(trainer, str(seed), part)}
             mine.append(run)
@@ -273,6 +273,11 @@ def main() -> int:
         raise ConfigError(f"env={config.env.label}: has no walking test")
     if given.envs < LEAST_ENVS:
         raise ConfigError(f"--envs={given.envs}: must be at least {LEAST_ENVS}")
+    if given.script_seeds is not None and (
+        given.script is None or not 1 <= given.script_seeds <= given.seeds
+    ):
+        allowed = f"needs --script, and is 1 to --seeds={given.seeds}"
+        raise ConfigError(f"--script-seeds={given.script_seeds}: {allowed}")
     if not isinstance(config.num_envs, int):
         raise ConfigError(f"num_envs={config.num_envs}: must be a number here")
     with tempfile.TemporaryDirectory() as scratch:

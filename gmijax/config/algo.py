@@ -150,7 +150,7 @@ class PolicyConfig(KeyGroup):
     def with_checkpoints(self, find: Callable[[str, str], Path]) -> Self:
         """This configuration with what it takes from other runs as paths of checkpoints.
 
-        `find` is given what the user wrote and the key: `gmijax.runs.resume.find_checkpoint`.
+        `find` is given what the user wrote and the key, as `gmijax.runs.resume.find_checkpoint`.
         """
         del find
         return self

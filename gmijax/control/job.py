@@ -203,10 +203,13 @@ class _TrainingJob:
         if attempt:
             self._look_again()
         config = started_from(self._config, checkpoint)
-        if attempt and config.run.profile is not None:
+        if attempt and config.run.profile is not None and self._run.profile.exists():
             # A tracer can be what failed, and would fail there again.
+            self._console.print(
+                f"run.profile={config.run.profile}: not traced again; what there is, is in "
+                f"{nearby(self._run.profile)}"
+            )
             config = replace(config, run=replace(config.run, profile=None))
-            self._console.print(f"run.profile={self._config.run.profile}: not traced again")
         if (lost := forgotten(config, self._plan)) is not None:
             self._console.print(lost)
         write_json(self._run.config, to_dict(config))

@@ -119,8 +119,10 @@ def _open(
     run, changes, folder = held.enter_context(opened(config, start_point))
     if start_point.folder is not None:
         clear_unfinished(run, start_point.checkpoint)
+    notes = list(changes)
     config = dataclasses.replace(config, physics=physics)
-    return _Member(started_from(config, start_point.checkpoint), run, folder), changes
+    config = started_from(config, start_point.checkpoint, notes.append)
+    return _Member(config, run, folder), notes
 
 
 def _prepare(members: Sequence[_Member], plan: Plan, gmis: RunPaths) -> None:

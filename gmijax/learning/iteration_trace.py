@@ -12,6 +12,8 @@ from typing import Any
 
 import jax
 
+from gmijax.runs.folder import write_bytes
+
 
 class IterationTrace:
     """Traces this process, its device included, from one iteration to another one.
@@ -32,6 +34,7 @@ class IterationTrace:
         self._traced: tuple[int, int] | None = None
         self._is_open = False
         self._error: str | None = None
+        self._before: dict[Path, int] = {}  # Of earlier commands.
         self._step = ExitStack()
         self._writing: Thread | None = None
 
@@ -69,7 +72,7 @@ class IterationTrace:
         """Ends the trace if it is open, and writes it.
 
         In this thread, so that nothing is launched meanwhile: a kernel that is launched while the
-        tracer detaches from a GPU can fail, and the process loses the GPU with it.
+        tracer detaches from a GPU can fail, and then the process cannot use the GPU any more.
         """
         if self._is_open:
             self._is_open = False
@@ -82,12 +85,18 @@ class IterationTrace:
 
     def _for_perfetto(self) -> None:
         """Writes the events once more, as Perfetto reads them: without JAX's metadata."""
-        traces = self._folder.glob("plugins/profile/*/*.trace.json.gz")
-        newest = max(traces, key=lambda path: path.stat().st_mtime)
-        trace = json.loads(gzip.decompress(newest.read_bytes()))
+        new = [path for path, at in self._traces().items() if self._before.get(path) != at]
+        if not new:
+            raise FileNotFoundError(f"JAX has written no events below {self._folder}")
+        trace = json.loads(gzip.decompress(new[0].read_bytes()))
         trace.pop("metadata", None)
-        written = gzip.compress(json.dumps(trace).encode())
-        newest.with_name("perfetto_trace.json.gz").write_bytes(written)
+        content = gzip.compress(json.dumps(trace).encode())
+        write_bytes(new[0].with_name("perfetto_trace.json.gz"), content)
+
+    def _traces(self) -> dict[Path, int]:
+        """Files of events, and when they were written."""
+        found = self._folder.glob("plugins/profile/*/*.trace.json.gz")
+        return {path: path.stat().st_mtime_ns for path in found}
 
     def outcome(self) -> dict[str, Any] | None:
         """First and last iteration, folder and error; None where nothing was to be written.
@@ -101,6 +110,7 @@ class IterationTrace:
     def _open(self) -> None:
         # First: JAX does not end a trace that it cannot write.
         self._folder.mkdir(exist_ok=True)
+        self._before = self._traces()
         options = jax.profiler.ProfileOptions()
         # Calls of Python are many, slow the iteration down, and say little about it.
         options.python_tracer_level = 0

@@ -15,7 +15,7 @@ from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.resume import any_checkpoint
 
-_OWN_KEYS: Final = ("run.dir", "run.name", "run.resume", "env.source_sha256")
+_OWN_KEYS: Final = ("run.dir", "run.name", "run.resume", "run.profile", "env.source_sha256")
 """Keys that every job has for itself, or of which something else is said."""
 
 

@@ -1,8 +1,8 @@
 """`sweep.jobs_per_gpu=auto`: how many jobs at a time make the most steps, by profiling.
 
 One job, two, four and so on train at the same time on one GPU, until more of them gain nothing or
-cannot run. What was measured is kept in the profile store of `gmijax.search`. Jobs that are over
-before that pays run at the same time, as far as memory allows.
+cannot run. What was measured is kept in the profile store of `gmijax.search`. If the jobs are too
+short for that to pay, as many run at the same time as fit in memory, up to eight.
 """
 
 from __future__ import annotations
@@ -18,25 +18,24 @@ from gmijax.autotune.store import ProfileStore
 from gmijax.autotune.tuner import workload_of
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import doing, is_verbose
+from gmijax.errors import ConfigError
 from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.density import GAIN
 from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.packs import most_together
 from gmijax.sweeps.profile_jobs import Bench, profile_jobs
-from gmijax.sweeps.slots import gmis_per_slot
+from gmijax.sweeps.slots import gmis_per_slot, plan_slots
 
 COUNTS = (1, 2, 4, 8, 16, 32)
 CORES_OF_A_JOB = 2
 """On a machine without GPUs."""
 
 _SHORT_S = 120.0
-"""Training that takes less, one job after another, gains nothing by more profiles: each number of
-jobs takes about half a minute."""
+"""If all jobs of a GPU train for less than this one after another, more profiles cost more than
+they save: each takes about half a minute."""
 
 _MOST_UNMEASURED = 8
-_CONTEXT_MIB = 1024
-"""Of GPU memory for a process, beside its arrays."""
 
 
 def with_jobs_per_gpu(
@@ -72,17 +71,14 @@ def with_jobs_per_gpu(
         if is_verbose(console):
             console.print(f"sweep.jobs_per_gpu={count}: {CORES_OF_A_JOB} cores for each job")
         return dataclasses.replace(settings, jobs_per_gpu=count)
-    kinds: dict[object, Job] = {}
+    kinds: dict[object, list[Job]] = {}
     for job in jobs:
         config = job.config
         kind = config.env.label, config.num_envs, config.algo.name, _size(job)
-        kinds.setdefault(kind, job)
+        kinds.setdefault(kind, []).append(job)
     bench = Bench(hosts[0], scratch, signals)
     most = _most(settings, jobs, hosts)
-    counts = [
-        _best(settings, job, most, most_together(settings, job, jobs), bench, console)
-        for job in kinds.values()
-    ]
+    counts = [_best(settings, alike, most, jobs, bench, console) for alike in kinds.values()]
     return dataclasses.replace(settings, jobs_per_gpu=max(1, min(*counts, most)))
 
 
@@ -102,20 +98,28 @@ def _most(settings: SweepConfig, jobs: Sequence[Job], hosts: Sequence[Host]) -> 
 
 
 def _best(
-    settings: SweepConfig, job: Job, most: int, together: int, bench: Bench, console: Console
+    settings: SweepConfig,
+    alike: Sequence[Job],
+    most: int,
+    jobs: Sequence[Job],
+    bench: Bench,
+    console: Console,
 ) -> int:
     """The number of such jobs at a time on the GPUs of one that makes the most steps.
 
-    More than `most` are not profiled, but for the number that is next to it. Up to `together` of
-    them are one program.
+    More than `most` are not profiled, but for the number that is next to it.
     """
-    config, task = job.config, job.config.env.label
-    own = {"job": "sweep", "size": _size(job)}
-    key = workload_of(config).store_key(bench.host.machine) | own
-    store = ProfileStore(config.search.store, key, console.print)
-    best, best_rate = 1, 0.0
+    job, task = alike[0], alike[0].config.env.label
+    together = most_together(settings, job, jobs)
+    store = _store_of(job, bench, console)
+    longest = most * max(one.config.num_timesteps for one in alike)
+    best, best_rate, unmeasured = 1, 0.0, None
     for count in COUNTS:
         if best >= most:
+            break
+        if unmeasured and store.get(*_of_store(job, count, together)) is None:
+            best = max(best, unmeasured)
+            console.print(f"  {task}: too short to measure more; {best} at a time fit in memory")
             break
         found = _profiled(settings, job, count, together, bench, store, console)
         if isinstance(found, NotRunnable):
@@ -129,12 +133,8 @@ def _best(
         if rate < best_rate * (1 + GAIN):
             break
         best, best_rate = count, rate
-        # What is known already costs nothing.
-        is_new = store.get(*_of_store(job, COUNTS[1], together)) is None
-        if count == 1 and together == 1 and is_new and _are_short(job, most, rate):
-            best = _that_fit(most, found, bench)
-            console.print(f"  {task}: all jobs are over before more is measured")
-            break
+        if count == 1 and together == 1 and longest < _SHORT_S * rate:
+            unmeasured = _that_fit(settings, job, most, found.memory_mib, bench)
     console.print(f"sweep.jobs_per_gpu={best} for {task}")
     return best
 
@@ -148,7 +148,7 @@ def _profiled(
     store: ProfileStore,
     console: Console,
 ) -> Measured | NotRunnable:
-    """What so many jobs at a time do, kept or measured now."""
+    """What so many jobs at a time do, kept or measured now; up to `together` are one program."""
 
     def measure() -> Measured | NotRunnable:
         label = job.config.env.label
@@ -159,6 +159,12 @@ def _profiled(
     return store.kept_or(kind, point, measure, job.config.search.profile_limit_s)
 
 
+def _store_of(job: Job, bench: Bench, console: Console) -> ProfileStore:
+    own = {"job": "sweep", "size": _size(job)}
+    key = workload_of(job.config).store_key(bench.host.machine) | own
+    return ProfileStore(job.config.search.store, key, console.print)
+
+
 def _of_store(job: Job, count: int, together: int) -> tuple[str, Point]:
     """Under which the store keeps it."""
     packed = min(count, together)
@@ -166,12 +172,24 @@ def _of_store(job: Job, count: int, together: int) -> tuple[str, Point]:
     return kind, Point(count, job.config.envs_per_gmi, str(job.config.physics.impl))
 
 
-def _are_short(job: Job, most: int, steps_per_s: float) -> bool:
-    """Whether as many jobs as each GPU has to run are soon over, one after another."""
-    return most * job.config.num_timesteps < _SHORT_S * steps_per_s
+def _that_fit(
+    settings: SweepConfig, job: Job, most: int, memory_mib: float, bench: Bench
+) -> int | None:
+    """As many of these jobs at a time as have `memory_mib` for each process, under MPS.
 
-
-def _that_fit(most: int, one: Measured, bench: Bench) -> int:
-    """As many of these jobs at a time as memory allows, at least one."""
-    memory_mib = min(gpu.memory_mib for gpu in bench.host.machine.gpus)
-    return max(1, min(most, _MOST_UNMEASURED, int(memory_mib / (one.memory_mib + _CONTEXT_MIB))))
+    None without MPS, where more jobs can be slower than one, and where memory is not known.
+    """
+    machine, size = bench.host.machine, gmis_per_slot(job.config)
+    total_mib = {gpu.uuid: gpu.memory_mib for gpu in machine.gpus}
+    for count in range(min(most, _MOST_UNMEASURED), 1, -1):
+        asked = dataclasses.replace(settings, jobs_per_gpu=count)
+        try:
+            plan = plan_slots(asked, machine, {job.config.plan.backend})
+        except ConfigError:
+            continue
+        if plan.backend != "mps" or memory_mib <= 1.0:
+            return None
+        parts = [(one.memory_fraction or 0.0, total_mib[one.device]) for one in plan.allocations]
+        if all(fraction * total / size >= memory_mib for fraction, total in parts):
+            return count
+    return 1

@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.gpu, pytest.mark.timeout(400)]
 
 @pytest.mark.parametrize("impl", ["jax", "warp"])
 def test_a_training_goes_on_after_its_trace(impl: str, tmp_path: Path) -> None:
-    """Its loops run as CUDA graphs, in which a tracer that leaves can break what comes next."""
+    """Its loops run as CUDA graphs, and a tracer that detaches can break the next launch."""
     if not detect_machine().gpus:
         pytest.skip("needs a GPU")
     if impl == "warp":

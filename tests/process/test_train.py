@@ -198,7 +198,8 @@ def test_a_run_that_starts_again_is_not_traced_again(tmp_path: Path) -> None:
     wait_until(lambda: bool(events(run, "recovered")), 120, "a recovery")
     job.send_signal(signal.SIGINT)
     assert job.wait(timeout=90) == 130
-    assert "run.profile=2:3: not traced again" in (tmp_path / "stdout.txt").read_text()
+    said = "run.profile=2:3: not traced again; what there is, is in run/profile"
+    assert said in (tmp_path / "stdout.txt").read_text()
     assert len(list(run.glob("profile/plugins/profile/*"))) == 1
     assert "profile" not in _read(run / "summary.json")
 

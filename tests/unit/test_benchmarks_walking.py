@@ -66,6 +66,15 @@ def test_a_folder_of_trainings_is_not_used_twice(tmp_path, monkeypatch):
         walking.main()
 
 
+@pytest.mark.parametrize("more", [("--script=--impl=jax",), ()])
+@pytest.mark.parametrize("count", ["0", "6", "-1"])
+def test_script_seeds_are_some_of_the_seeds(count, more, tmp_path, monkeypatch):
+    given = ("env=go1", "num_envs=64", f"--script-seeds={count}", f"--out={tmp_path}", *more)
+    monkeypatch.setattr("sys.argv", ["walking", *given])
+    with pytest.raises(ConfigError, match=f"^--script-seeds={count}: needs --script, and is 1 to"):
+        walking.main()
+
+
 def test_every_seed_is_trained_and_tested_on_a_gpu_of_its_own(tmp_path, monkeypatch):
     gpus = tuple(Gpu(n, f"GPU-{n}", "some GPU", 80000, (9, 0), False) for n in (0, 1))
     for user in (walking, records):
@@ -305,7 +314,7 @@ def test_one_program_tests_all_checkpoints_of_a_kind(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("works", "script_seeds", "by_script"),
-    [(True, (), [0, 1]), (False, (), [0, 1]), (True, ("--script-seeds=1",), [1])],
+    [(True, (), [0, 1]), (False, (), [0, 1]), (True, ("--script-seeds=1",), [0])],
 )
 def test_a_call_trains_tests_and_writes_what_it_found(
     works, script_seeds, by_script, tmp_path, monkeypatch

@@ -96,6 +96,29 @@ def test_a_trace_that_cannot_be_written_ends_no_training(tmp_path: Path):
     assert _trained(IterationTrace((1, 1), tmp_path), 1)["error"] is None
 
 
+def test_a_trace_of_an_earlier_command_stays_as_it_is(tmp_path: Path):
+    earlier = tmp_path / "plugins" / "profile" / "2020_01_01_00_00_00"
+    earlier.mkdir(parents=True)
+    for name in ("host.trace.json.gz", "perfetto_trace.json.gz"):
+        (earlier / name).write_bytes(b"as it was")
+    assert _trained(IterationTrace((1, 1), tmp_path), 2)["error"] is None
+    found = sorted(tmp_path.glob("plugins/profile/*/perfetto_trace.json.gz"))
+    assert [path.read_bytes() == b"as it was" for path in found] == [True, False]
+
+
+def test_a_tracer_that_writes_no_events_is_an_error(tmp_path: Path, monkeypatch):
+    stop = jax.profiler.stop_trace
+
+    def stop_and_lose() -> None:
+        stop()
+        for path in tmp_path.glob("plugins/profile/*/*.trace.json.gz"):
+            path.unlink()
+
+    monkeypatch.setattr(jax.profiler, "stop_trace", stop_and_lose)
+    outcome = _trained(IterationTrace((1, 1), tmp_path), 2)
+    assert outcome["error"] == f"JAX has written no events below {tmp_path}"
+
+
 @pytest.mark.parametrize(
     "wanted", ["5", "0:3", "5:4", "a:b", "3:", ":3", "1:2:3", "1:99999999999"]
 )

@@ -624,45 +624,71 @@ def test_jobs_at_a_time_by_profiling(
     assert done == profiled
 
 
+MPS = Path("/usr/bin/nvidia-cuda-mps-control")
+
+
 @pytest.mark.parametrize(
-    ("num_jobs", "num_timesteps", "memory_mib", "profiled", "expected"),
+    ("num_jobs", "millions", "memory_mib", "mps", "profiled", "expected"),
     [
-        (3, 39e6, 100.0, [1], 3),
-        (3, 41e6, 100.0, [1, 2, 4], 2),
-        (30, 3.9e6, 100.0, [1], 8),
-        (8, 1e6, 20_000.0, [1], 6),
-        (8, 1e6, 90_000.0, [1], 1),
+        (3, 39, 100.0, MPS, [1], 3),
+        (3, 41, 100.0, MPS, [1, 2, 4], 2),
+        (30, 3.9, 100.0, MPS, [1], 8),
+        (8, 1, 20_000.0, MPS, [1], 5),
+        (8, 1, 90_000.0, MPS, [1], 1),
+        (3, 1, 100.0, None, [1, 2, 4], 2),
+        (3, 1, 1.0, MPS, [1, 2, 4], 2),
     ],
-    ids=["short", "long", "many", "large", "as large as the GPU"],
+    ids=["short", "long", "many", "large", "as large as the GPU", "no MPS", "unknown memory"],
 )
 def test_what_is_soon_over_is_not_profiled_for_long(
     num_jobs: int,
-    num_timesteps: float,
+    millions: float,
     memory_mib: float,
+    mps: Path | None,
     profiled: list[int],
     expected: int,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     done: list[int] = []
+    rates = {1: 1e6, 2: 0.8e6, 4: 1e5}
 
     def profile(_: SweepConfig, __: Job, count: int, *___: Any) -> Measured:
         done.append(count)
-        return Measured(1e6 if count == 1 else 0.8e6 if count == 2 else 1e5, memory_mib, 0.1)
+        return Measured(rates[count], memory_mib, 0.1)
+
+    def chosen(num_jobs: int, millions: float, *overrides: str) -> int | str:
+        line = (f"num_timesteps={int(millions * 1e6)}", *overrides)
+        jobs = jobs_of([compose(f"seed={seed}", *line) for seed in range(num_jobs)])
+        hosts, quiet = [LocalHost(machine(1, mps_control=mps))], open_console(show=False)
+        return with_jobs_per_gpu(SweepConfig(), jobs, hosts, quiet, StopSignals()).jobs_per_gpu
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(jobs_per_gpu, "profile_jobs", profile)
-    line = f"num_timesteps={int(num_timesteps)}"
-    jobs = jobs_of([compose(f"seed={seed}", line) for seed in range(num_jobs)])
-    hosts, quiet = [LocalHost(machine(1))], open_console(show=False)
-    found = with_jobs_per_gpu(SweepConfig(), jobs, hosts, quiet, StopSignals())
-    assert (found.jobs_per_gpu, done) == (expected, profiled)
-    # What was measured in a longer sweep is taken.
-    longer = jobs_of([compose(f"seed={seed}", "num_timesteps=1000000000") for seed in range(3)])
-    with_jobs_per_gpu(SweepConfig(), longer, hosts, quiet, StopSignals())
-    again = with_jobs_per_gpu(SweepConfig(), jobs, hosts, quiet, StopSignals())
-    assert again.jobs_per_gpu == min(2, num_jobs)
+    assert (chosen(num_jobs, millions), done) == (expected, profiled)
+    # What was measured for a longer sweep is taken.
+    assert chosen(2, 1000) == 2
+    assert done[-1] == 2 or profiled == [1, 2, 4]
+    assert chosen(3, 1000) == 2
+    assert chosen(num_jobs, millions) == 2
     assert done == [1, 2, 4]
+
+
+def test_the_longest_job_of_a_kind_says_whether_they_are_short(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[int] = []
+
+    def profile(_: SweepConfig, __: Job, count: int, *___: Any) -> Measured:
+        done.append(count)
+        return Measured(1e6 / count, 100.0, 0.1)
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(jobs_per_gpu, "profile_jobs", profile)
+    jobs = jobs_of([compose(f"num_timesteps={steps}") for steps in (1_000_000, 1_000_000_000)])
+    hosts, quiet = [LocalHost(machine(1, mps_control=MPS))], open_console(show=False)
+    with_jobs_per_gpu(SweepConfig(), jobs, hosts, quiet, StopSignals())
+    assert done == [1, 2]
 
 
 @pytest.mark.parametrize(

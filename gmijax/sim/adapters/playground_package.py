@@ -46,10 +46,9 @@ class _Models:
 
 @contextmanager
 def _imported_when_used(name: str) -> Iterator[None]:
-    """A module that is imported within it runs on its first use.
+    """Within it, to import the module `name` defers running it until its first use.
 
-    Playground's wrapper for PyTorch imports it, which takes seconds in every GMI where it is
-    installed.
+    Playground's wrapper for PyTorch imports PyTorch, which takes seconds in every GMI.
     """
     finder = _Later(name)
     sys.meta_path.insert(0, finder)
@@ -60,7 +59,7 @@ def _imported_when_used(name: str) -> Iterator[None]:
 
 
 class _Later(MetaPathFinder):
-    """Finds one module, and leaves it to its first use."""
+    """Finds one module, and defers running it until its first use."""
 
     def __init__(self, name: str) -> None:
         self._name = name
