@@ -19,7 +19,7 @@ _GOES_ON = (*_TRAIN, FOREVER, "run.keep_checkpoints=3", "run.dir={run}", "run.re
 _PROFILES = (
     *(key for key in _TRAIN if not key.startswith(("num_envs=", "run.checkpoint"))),
     *("plan.gpus=1", "search.store={home}/store", "search.gmis_per_gpu=[1]"),
-    *("search.num_envs=[16,32]"),
+    "search.num_envs=[16,32]",
 )
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import shutil
 from pathlib import Path
 
 import pytest
+from fault_commands import COMMANDS
 from fault_deck import ALL_KINDS, Case, Trial, draw_trials, faults_of
 from fault_plan import place_faults
 from fault_trials import kinds_here, run_trial
@@ -39,6 +41,12 @@ def fixtures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_deck_has_every_kind_once():
     drawn = [kind for trial in DECKS for kind in faults_of(trial)]
     assert sorted(drawn) == sorted([*ALL_KINDS] * len(SEEDS))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_that_gets_faults_is_of_keys_and_values(name: str):
+    words = COMMANDS[name].overrides
+    assert [word for word in words if not re.match(r"[a-z_.]{3,}=", word)] == []
 
 
 @pytest.mark.timeout(900)
