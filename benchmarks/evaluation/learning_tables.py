@@ -218,9 +218,14 @@ def walking(calls: Calls) -> Rows:
 
 def _physics(call: Call, trainer: str) -> str:
     """The MJX implementation that this trainer's policies were trained and tested with."""
-    runs = [run["checkpoints"] for run in call.results["runs"] if run["trainer"] == trainer]
-    found = (one["walk"]["impl"] for checkpoints in runs for one in checkpoints if "walk" in one)
+    found = (one["walk"]["impl"] for tests in _tests_of(call, trainer) for one in tests)
     return next(found, "")
+
+
+def _tests_of(call: Call, trainer: str) -> list[list[Mapping[str, Any]]]:
+    """The tested checkpoints of every training."""
+    runs = [run["checkpoints"] for run in call.results["runs"] if run["trainer"] == trainer]
+    return [[one for one in checkpoints if "walk" in one] for checkpoints in runs]
 
 
 def seconds_until_it_walks(task: str) -> Figure | None:
@@ -238,9 +243,7 @@ def seconds_until_it_walks(task: str) -> Figure | None:
 
 def _last_tests(call: Call, trainer: str) -> Iterator[str]:
     """The last test of every training: medians over seeds."""
-    runs = [run["checkpoints"] for run in call.results["runs"] if run["trainer"] == trainer]
-    tested = [[one for one in checkpoints if "walk" in one] for checkpoints in runs]
-    last = [checkpoints[-1] for checkpoints in tested if checkpoints]
+    last = [tests[-1] for tests in _tests_of(call, trainer) if tests]
     settled = [one["walk"]["settled"] for one in last]
     for form, values in (
         (".0f", [one["env_steps"] / 1e6 for one in last]),

@@ -11,7 +11,7 @@ from hydra.core.override_parser.types import Override
 
 from gmijax.config.schema import flatten
 from gmijax.runs.folder import RunPaths, given_run
-from gmijax.runs.saved_config import require_known_keys, saved_config
+from gmijax.runs.saved_config import config_of_run, require_known_keys
 
 NAMED_BY_TASK: Final = ("env.rewards.", "env.settings.")
 """Groups of keys whose names, which may have dots, are the task's; those of tasks of others only
@@ -54,7 +54,7 @@ def as_the_run_was(
     paths = RunPaths(Path(folder))
     if not os.path.lexists(paths.config):
         return data
-    saved = saved_config(paths.checkpoint(0))
+    saved = config_of_run(paths)
     if not _is_alike(data, saved):
         return data
     require_known_keys(saved, f"run.resume=auto: {folder}")

@@ -80,9 +80,9 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
         notes = [*reasons, *replay_line(config, plan)]
         members: list[_Member] = []
         for own, start_point in zip(configs, start_points, strict=True):
-            member, changes = _open(own, config.physics, start_point, held)
+            member, about = _open(own, config.physics, start_point, held)
             members.append(member)
-            notes += (*changes, *filter(None, [forgotten(member.config, plan)]))
+            notes += (*about, *filter(None, [forgotten(member.config, plan)]))
         what = f"{len(members)} runs of {plan.num_envs_per_gmi} environments in one program"
         announce(console, gmis, plan, what, tuple(dict.fromkeys(notes)))
         _prepare(members, plan, gmis)
@@ -115,11 +115,11 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
 def _open(
     config: TrainConfig, physics: PhysicsConfig, start_point: StartPoint, held: ExitStack
 ) -> tuple[_Member, Sequence[str]]:
-    """One of the runs with its folder, which is held, and what differs from its saved keys."""
-    run, changes, folder = held.enter_context(opened(config, start_point))
+    """One of the runs with its folder, which is held, and what the user should know of it."""
+    run, about, folder = held.enter_context(opened(config, start_point))
     if start_point.folder is not None:
         clear_unfinished(run, start_point.checkpoint)
-    notes = list(changes)
+    notes = list(about)
     config = dataclasses.replace(config, physics=physics)
     config = started_from(config, start_point.checkpoint, notes.append)
     return _Member(config, run, folder), notes

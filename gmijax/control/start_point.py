@@ -27,6 +27,7 @@ from gmijax.runs.history import read_metrics
 from gmijax.runs.names import nearby
 from gmijax.runs.resume import choose_checkpoint
 from gmijax.runs.saved_config import (
+    config_of_run,
     differences,
     require_known_keys,
     saved_config,
@@ -110,8 +111,7 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
         raise ConfigError(f"{shown} {NO_RUN_FOLDER}")
     if not run.config.exists():
         return StartPoint(run)
-    # The folder of a checkpoint that may not be there yet.
-    saved = saved_config(run.checkpoint(0))
+    saved = config_of_run(run)
     env, algo = task_and_algorithm(saved)
     was, wanted = (env.label, algo.name), (config.env.label, config.algo.name)
     if was != wanted:

@@ -23,7 +23,7 @@ from gmijax.player.plain_env import PlainEnv, task_of
 from gmijax.player.policy import PlainPolicy, checkpoint_policy
 from gmijax.player.shipped import require_alone, require_shipped, shipped_policy
 from gmijax.runs.folder import RunPaths
-from gmijax.runs.saved_config import task_of_run
+from gmijax.runs.saved_config import config_of_run, task_and_algorithm
 from gmijax.sim.registry import require_own
 from gmijax.viewer.checkpoints import Checkpoints
 from gmijax.viewer.guard import Guard, is_loopback
@@ -91,8 +91,9 @@ def opened_once_saved(
             except NoCheckpointYet as error:
                 if not is_waiting:
                     require_packages()  # Rather now than after the wait.
-                    if RunPaths(error.run).config.exists():
-                        require_own(task_of_run(error.run))
+                    # It is being trained, so it has a configuration.
+                    env, _ = task_and_algorithm(config_of_run(RunPaths(error.run)))
+                    require_own(env)
                     waiting.enter_context(doing(console, f"waiting: {error}"))
                 is_waiting = True
             time.sleep(_POLL_S)

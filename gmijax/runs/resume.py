@@ -15,12 +15,7 @@ from gmijax.runs.checkpoints import (
     newest_checkpoint,
     what_is_broken,
 )
-from gmijax.runs.folder import (
-    META,
-    RUNS,
-    RunPaths,
-    read_json,
-)
+from gmijax.runs.folder import META, RUNS, RunPaths, read_json
 from gmijax.runs.held import is_locked
 from gmijax.runs.names import nearby
 

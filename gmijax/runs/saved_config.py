@@ -29,32 +29,36 @@ def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
 
 
 def saved_config(checkpoint: Path) -> dict[str, Any]:
-    """The configuration of the run that a checkpoint lies in, as plain data.
+    """The configuration of the run that a checkpoint lies in, see `config_of_run`.
+
+    Raises:
+      ConfigError: the checkpoint does not lie in the folder of a training run.
+    """
+    run = RunPaths(checkpoint.parent.parent)
+    if not os.path.lexists(run.config):
+        raise ConfigError(
+            f"checkpoint {checkpoint}: no config.json in {run.root}; "
+            "a checkpoint can only be used in its run folder"
+        )
+    return config_of_run(run)
+
+
+def config_of_run(run: RunPaths) -> dict[str, Any]:
+    """The configuration of a run that has one, with or without checkpoints, as plain data.
 
     Keys that its version of gmijax did not know are missing, and so are removed ones with the
     value that every job now has.
 
     Raises:
-      ConfigError: the checkpoint does not lie in the folder of a training run.
+      ConfigError: it is not that of a training run.
     """
-    path = RunPaths(checkpoint.parent.parent).config
-    if not os.path.lexists(path):
-        raise ConfigError(
-            f"checkpoint {checkpoint}: no config.json in {path.parent}; "
-            "a checkpoint can only be used in its run folder"
-        )
-    saved = without_removed(read_json(path))
+    saved = without_removed(read_json(run.config))
     if not all(isinstance(saved.get(group), dict) for group in ("env", "algo", "run")):
-        raise ConfigError(f"{path}: not the configuration of a training run")
+        raise ConfigError(f"{run.config}: not the configuration of a training run")
     if saved["env"].get("suite") == "custom":
         # A file of which nothing is noted is none that can be recognised.
         saved["env"]["source_sha256"] = saved["env"].get("source_sha256") or ""
     return saved
-
-
-def task_of_run(run: Path) -> EnvConfig:
-    """The task of a training run, with or without checkpoints; errors as of `trained_config`."""
-    return trained_config(RunPaths(run).checkpoint(0))[0]
 
 
 def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:

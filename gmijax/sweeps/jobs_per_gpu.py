@@ -24,7 +24,7 @@ from gmijax.sweeps.density import GAIN
 from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.packs import most_together
-from gmijax.sweeps.profile_jobs import Bench, profile_jobs
+from gmijax.sweeps.profile_jobs import UNKNOWN_MIB, Bench, profile_jobs
 from gmijax.sweeps.slots import gmis_per_slot, plan_slots
 
 COUNTS = (1, 2, 4, 8, 16, 32)
@@ -112,7 +112,7 @@ def _best(
     job, task = alike[0], alike[0].config.env.label
     together = most_together(settings, job, jobs)
     store = _store_of(job, bench, console)
-    longest = most * max(one.config.num_timesteps for one in alike)
+    steps = most * max(one.config.num_timesteps for one in alike)
     best, best_rate, unmeasured = 1, 0.0, None
     for count in COUNTS:
         if best >= most:
@@ -133,7 +133,7 @@ def _best(
         if rate < best_rate * (1 + GAIN):
             break
         best, best_rate = count, rate
-        if count == 1 and together == 1 and longest < _SHORT_S * rate:
+        if count == 1 and together == 1 and steps < _SHORT_S * rate:
             unmeasured = _that_fit(settings, job, most, found.memory_mib, bench)
     console.print(f"sweep.jobs_per_gpu={best} for {task}")
     return best
@@ -179,6 +179,8 @@ def _that_fit(
 
     None without MPS, where more jobs can be slower than one, and where memory is not known.
     """
+    if memory_mib <= UNKNOWN_MIB:
+        return None
     machine, size = bench.host.machine, gmis_per_slot(job.config)
     total_mib = {gpu.uuid: gpu.memory_mib for gpu in machine.gpus}
     for count in range(min(most, _MOST_UNMEASURED), 1, -1):
@@ -187,7 +189,7 @@ def _that_fit(
             plan = plan_slots(asked, machine, {job.config.plan.backend})
         except ConfigError:
             continue
-        if plan.backend != "mps" or memory_mib <= 1.0:
+        if plan.backend != "mps":
             return None
         parts = [(one.memory_fraction or 0.0, total_mib[one.device]) for one in plan.allocations]
         if all(fraction * total / size >= memory_mib for fraction, total in parts):

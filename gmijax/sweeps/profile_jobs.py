@@ -23,6 +23,9 @@ from gmijax.sweeps.slots import Site, SlotPool, plan_slots
 from gmijax.sweeps.study import Study
 from gmijax.sweeps.training import TrainingKind
 
+UNKNOWN_MIB = 1.0
+"""Memory of jobs that did not say how much they took."""
+
 _FOREVER = 10**12
 
 
@@ -110,6 +113,7 @@ def profiled_job(job: Job, seed: int, num_timesteps: int) -> Job:
 
 
 def _memory_mib(paths: SweepPaths, jobs: Sequence[Job]) -> float:
-    """Peak memory of the largest job, MiB."""
+    """Peak memory of the largest job, MiB; `UNKNOWN_MIB` where none says it."""
     results = [TrainResult.read(paths.job(job.number).gmi(0).result) for job in jobs]
-    return max([one.peak_memory_mib or 1.0 for one in results if one is not None], default=1.0)
+    peaks = [one.peak_memory_mib or UNKNOWN_MIB for one in results if one is not None]
+    return max(peaks, default=UNKNOWN_MIB)
