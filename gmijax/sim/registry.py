@@ -293,7 +293,9 @@ def _make(name: str, suite: str, changes: Mapping[str, Any], **options: Any) -> 
     _require_changes(name, suite, **changes)
     options |= {key: value for key, value in changes.items() if value}
     if suite == "gmijax":
-        env: Env = importlib.import_module(TASKS[name]).make(**options)
+        from gmijax.sim.traced import traced_once
+
+        env: Env = traced_once(importlib.import_module(TASKS[name]).make(**options))
     else:
         env = importlib.import_module(SUITES[suite]).make(name, **options)
     if changes["curriculum"] and env.next_episode is None:

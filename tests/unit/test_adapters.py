@@ -77,7 +77,7 @@ def unrolled(theirs: Counter, *actions: float) -> list[Any]:
     step = jax.jit(env.step)
     outputs: list[Any] = [(state, None)]
     for action in actions:
-        state, out = step(env.model, state, jnp.full((NUM_ENVS, 2), action))
+        state, out = step(env.model, state, jnp.full((NUM_ENVS, 2), action, jnp.float32))
         outputs.append((state, out))
     return outputs
 
@@ -175,6 +175,26 @@ def test_a_step_leaves_the_state_that_it_is_given_alone():
     state = env.reset(env.model, jax.random.key(0))
     env.step(env.model, state, jnp.zeros(2))
     assert float(state.task.info["steps"]) == 0.0
+
+
+class Traced(Counter):
+    """Counts how often Python goes through its functions."""
+
+    resets = steps = 0
+
+    def reset(self, rng: jax.Array) -> Any:
+        self.resets += 1
+        return super().reset(rng)
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        self.steps += 1
+        return super().step(state, action)
+
+
+def test_however_many_programs_have_an_environment_it_is_traced_once():
+    theirs = Traced()
+    unrolled(theirs, 0.0, 0.0)
+    assert (theirs.resets, theirs.steps) == (1, 1)
 
 
 class Seeing(Counter):

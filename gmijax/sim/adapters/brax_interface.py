@@ -20,6 +20,7 @@ from gmijax.errors import ConfigError
 from gmijax.sim import episode
 from gmijax.sim.adapters.checks import check_env
 from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.traced import inlined, traced_once
 from gmijax.types import Array, PRNGKey, PyTree
 
 POLICY_OBS, PRIVILEGED_OBS = "state", "privileged_state"
@@ -80,7 +81,9 @@ def adapt(
     Raises:
       ConfigError: observations that are no vectors, or a state that changes its shape.
     """
-    start = jax.eval_shape(theirs.reset, jax.random.key_data(jax.random.key(0)))
+    own = partial(with_model, theirs)
+    start_of = inlined(partial(_start, theirs, own))
+    start = jax.eval_shape(start_of, (), jax.random.key_data(jax.random.key(0)))
     if mj_model is not None and (
         qpos is None or jax.eval_shape(qpos, start).shape != (mj_model.nq,)
     ):
@@ -90,10 +93,9 @@ def adapt(
     def positions(state: EnvState) -> Array:
         return jnp.zeros(0) if qpos is None else qpos(state.physics)
 
-    own = partial(with_model, theirs)
-    reset, step = partial(_reset, theirs, own, spec), partial(_step, theirs, own)
+    reset, step = partial(_reset, start_of, spec), partial(_step, theirs, own)
     env = Env(spec, (), reset, step, mj_model, positions)
-    env = env._replace(next_episode=partial(_next_episode, spec))
+    env = traced_once(env._replace(next_episode=partial(_next_episode, spec)))
     check_env(env, f"env.name={name}")
     return env
 
@@ -112,11 +114,17 @@ def _spec_of(theirs: Any, start: Any, name: str, episode_length: int) -> EnvSpec
     )
 
 
-def _reset(theirs: Any, own: WithModel, spec: EnvSpec, model: PyTree, key: PRNGKey) -> EnvState:
-    key, draw = jax.random.split(key)
+def _start(theirs: Any, own: WithModel, model: PyTree, key_data: Array) -> Any:
     with own(model):
-        # They were written for keys that are plain integers.
-        state = jax.tree.map(jnp.asarray, theirs.reset(jax.random.key_data(draw)))
+        return jax.tree.map(jnp.asarray, theirs.reset(key_data))
+
+
+def _reset(
+    start_of: Callable[[PyTree, Array], Any], spec: EnvSpec, model: PyTree, key: PRNGKey
+) -> EnvState:
+    key, draw = jax.random.split(key)
+    # They were written for keys that are plain integers.
+    state = start_of(model, jax.random.key_data(draw))
     first = state.replace(info={})
     return episode.begin(spec, first, Carried(first, state.info), observation(state.obs), key)
 

@@ -23,6 +23,7 @@ from gmijax.sim.adapters.checks import attempt, check_env, check_start
 from gmijax.sim.adapters.neighbours import importable
 from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.source import split
+from gmijax.sim.traced import traced_once
 
 _DTYPES: Mapping[str, Any] = MappingProxyType(
     {
@@ -71,7 +72,7 @@ def make(
         env = attempt(what, found, impl=impl, max_envs=max_envs, **given)
         require_32_bit(what)
         if isinstance(env, Env):
-            env = _with_arrays(env)
+            env = traced_once(_with_arrays(env))
         env = check_env(env, what)
         check_start(env, what)
     return env
