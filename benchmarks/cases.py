@@ -34,7 +34,7 @@ REWARD = ("ant", "anymal", "humanoid")
 PLANS = ((1, 65536), (4, 16384), (2, 32768))
 """GMIs on one GPU and environments in each, where it is near saturation."""
 
-_NO_RATES, _NO_CHECKPOINTS = "run.measure_throughput=false", "run.checkpoint_every=0"
+_RATES, _NO_CHECKPOINTS = "run.measure_throughput=true", "run.checkpoint_every=0"
 
 
 def _throughput(task: str, num_envs: int) -> Case:
@@ -42,7 +42,7 @@ def _throughput(task: str, num_envs: int) -> Case:
     return _case(
         f"{task} warp {num_envs}",
         f"env={task} physics.impl=warp num_envs={num_envs} num_timesteps={12 * 32 * num_envs} "
-        f"{_NO_CHECKPOINTS}",
+        f"{_RATES} {_NO_CHECKPOINTS}",
     )
 
 
@@ -51,7 +51,7 @@ def _plan(task: str, gmis: int, num_envs: int) -> Case:
     return _case(
         f"{task} {gmis} x {num_envs}",
         f"env={task} physics.impl=warp num_envs={num_envs} plan.gmis_per_gpu={gmis} "
-        f"num_timesteps={8 * 32 * gmis * num_envs} {_NO_RATES} {_NO_CHECKPOINTS}",
+        f"num_timesteps={8 * 32 * gmis * num_envs} {_NO_CHECKPOINTS}",
     )
 
 
@@ -61,7 +61,7 @@ def _templates(task: str) -> tuple[Case, ...]:
     # host memory.
     shared = (
         f"env={task} num_envs=2048 num_timesteps={12 * 32 * 2 * 2048} plan.backend=mps "
-        f"{_NO_RATES} {_NO_CHECKPOINTS} reduce.strategy=paper"
+        f"{_NO_CHECKPOINTS} reduce.strategy=paper"
     )
     return (
         _case("2 GMIs x 2048, tcg_ex", f"{shared} plan.gmis_per_gpu=2"),
@@ -86,7 +86,7 @@ def _channel_designs(task: str) -> tuple[Case, ...]:
     """The paper's table: one GPU acts, one trains; experience by channels, or tensor by tensor."""
     shared = (
         f"env={task} algo=a3c num_envs=2048 num_timesteps=10e6 channel.capacity_mib=256 "
-        f"{_on('1', '1', 1, 1)} {_NO_CHECKPOINTS} {_NO_RATES}"
+        f"{_on('1', '1', 1, 1)} {_NO_CHECKPOINTS}"
     )
     return tuple(
         _case(f"{task} {design}", f"{shared} channel.design={design}", 2)
@@ -105,7 +105,7 @@ def _lgr(task: str) -> tuple[Case, ...]:
             # A dozen iterations of the longest rollout.
             f"env={task} num_envs=2048 num_timesteps={12 * 32 * 2048 * gpus * gmis} "
             f"plan.gpus={gpus} plan.gmis_per_gpu={gmis} plan.backend=mps "
-            f"reduce.strategy={strategy} {_NO_RATES} {_NO_CHECKPOINTS}",
+            f"reduce.strategy={strategy} {_NO_CHECKPOINTS}",
             gpus,
         )
         for gpus, gmis in ((2, 2), (2, 3), (4, 4))
@@ -119,7 +119,7 @@ def _scaling(gpus: int, gmis: int, backend: str = "auto") -> Case:
     return _case(
         f"{gpus} GPUs x {gmis} GMIs x {num_envs}" + ", share" * (backend == "share"),
         f"env=ant num_envs={num_envs} num_timesteps={60 * 16 * 8192 * gpus} plan.gpus={gpus} "
-        f"plan.gmis_per_gpu={gmis} plan.backend={backend} {_NO_RATES} {_NO_CHECKPOINTS}",
+        f"plan.gmis_per_gpu={gmis} plan.backend={backend} {_NO_CHECKPOINTS}",
         gpus,
     )
 
@@ -129,7 +129,7 @@ def _reward(task: str, gmis: int) -> Case:
     return _case(
         f"{task} {gmis} x {8192 // gmis}",
         f"env={task} num_envs={8192 // gmis} num_timesteps=50e6 plan.gmis_per_gpu={gmis} "
-        f"seed={{run}} {_NO_RATES} {_NO_CHECKPOINTS}",
+        f"seed={{run}} {_NO_CHECKPOINTS}",
     )
 
 
@@ -138,14 +138,14 @@ def _sac(gpus: int, batch_size: int) -> Case:
     return _case(
         f"{gpus} GPUs x 4096, batches of {gpus} x {batch_size}",
         f"env=ant algo=sac num_envs=4096 num_timesteps={64 * 16 * 4096 * gpus} plan.gpus={gpus} "
-        f"algo.batch_size={batch_size} {_NO_RATES} {_NO_CHECKPOINTS}",
+        f"algo.batch_size={batch_size} {_NO_CHECKPOINTS}",
         gpus,
     )
 
 
 def _long(name: str, gpus: int, num_envs: int, overrides: str = "") -> Case:
     """100M steps of ant, with one agent on each GPU unless `overrides` say otherwise."""
-    own = f"env=ant physics.impl=warp num_timesteps=100e6 {_NO_RATES} num_envs={num_envs}"
+    own = f"env=ant physics.impl=warp num_timesteps=100e6 num_envs={num_envs}"
     return _case(name, f"{own} {overrides}", gpus)
 
 

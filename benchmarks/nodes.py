@@ -35,7 +35,7 @@ from gmijax.runs.folder import RunPaths, read_json
 
 JOB = (
     *("env=ant", "num_envs=8192", "num_timesteps=60e6"),
-    *("run.measure_throughput=false", "run.max_restarts=0"),
+    "run.max_restarts=0",
 )
 LONGEST_S = 180.0
 """Of a run: nodes that cannot reach each other by NCCL wait for much longer."""

@@ -168,8 +168,8 @@ def sweep_report(
       deadline_s: see `wait_until`.
       variables: of the environment.
     """
-    more = ("run.measure_throughput=false", *words, f"run.dir={folder}")
-    code = run_command([sys.executable, "-m", "gmijax.sweep", *more], deadline_s, variables)
+    command = [sys.executable, "-m", "gmijax.sweep", *words, f"run.dir={folder}"]
+    code = run_command(command, deadline_s, variables)
     report = folder / "sweep.json"
     if not report.exists():
         raise SystemExit(f"no result of a sweep with {' '.join(words)} (exit code {code})")

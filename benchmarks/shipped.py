@@ -129,7 +129,7 @@ def overrides(task: str, given: argparse.Namespace) -> Sequence[str]:
     recipe = RECIPES[task]
     steps = max(1, int(recipe.steps * given.scale))
     return [
-        *(f"env={task}", f"num_timesteps={steps}", f"seed={SEED}", "run.measure_throughput=false"),
+        *(f"env={task}", f"num_timesteps={steps}", f"seed={SEED}"),
         *(f"eval.every={-(-steps // EVALUATIONS)}", "run.checkpoint_every=0"),
         *(*recipe.overrides, *given.overrides),
     ]

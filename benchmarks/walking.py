@@ -131,7 +131,7 @@ class Benchmark:
         per_iteration = config.num_envs * getattr(config.algo, "unroll_length", 1)
         every = max(1, config.num_timesteps // per_iteration // self._given.tests)
         overrides = [
-            *("plan.gpus=1", "plan.gmis_per_gpu=1", "run.measure_throughput=false"),
+            *("plan.gpus=1", "plan.gmis_per_gpu=1"),
             *(f"run.checkpoint_every={every}", "run.keep_checkpoints=null"),
             *(*self._given.overrides, f"run.dir={folder / 'run'}"),
             "num_timesteps=1" if is_short else f"seed={seed}",

@@ -157,7 +157,7 @@ def _training(overrides: Sequence[str], task: str) -> Any:
     from gmijax.cli.compose import compose
 
     steps = GPU_STEPS if detect_machine().gpus else CPU_STEPS
-    own = {"env": task, "num_timesteps": steps, "run.measure_throughput": "false"}
+    own = {"env": task, "num_timesteps": steps}
     given = {text.partition("=")[0] for text in overrides}
     short = [f"{key}={value}" for key, value in own.items() if key not in given]
     return compose(*short, *overrides)

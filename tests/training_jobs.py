@@ -20,7 +20,7 @@ from gmijax.supervise.heartbeat import Heartbeat, HeartbeatBlock
 
 TINY = (
     *("env=ball_balance", "num_envs=16", "algo.unroll_length=4", "algo.num_minibatches=2"),
-    *("algo.num_updates_per_batch=2", "run.measure_throughput=false", "run.grace_s=3"),
+    *("algo.num_updates_per_batch=2", "run.grace_s=3"),
     *("algo.policy_hidden_layer_sizes=[8]", "algo.value_hidden_layer_sizes=[8]"),
     "run.max_restarts=0",
 )

@@ -116,7 +116,7 @@ class Side(NamedTuple):
 
     @property
     def _overrides(self) -> tuple[str, ...]:
-        one = ("plan.gpus=1", "plan.gmis_per_gpu=1", "run.measure_throughput=false")
+        one = ("plan.gpus=1", "plan.gmis_per_gpu=1")
         return (*COMPARISONS[self.comparison].overrides, *one, *self.more)
 
     def _train(self, folder: Path, *more: str) -> list[str]:

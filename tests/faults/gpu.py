@@ -25,7 +25,7 @@ from tests.training_jobs import heartbeat_of, pids_of, wait_until
 OVERRIDES = (
     *("env=ant", "physics.impl=jax", "num_envs=2048", "plan.gpus=1", "plan.gmis_per_gpu=4"),
     *("plan.backend=mps", "num_timesteps=1000000000000", "run.checkpoint_every=20"),
-    *("run.measure_throughput=false", "run.stall_timeout_s=20", "reduce.timeout_s=15"),
+    *("run.stall_timeout_s=20", "reduce.timeout_s=15"),
     "run.grace_s=3",
 )
 

@@ -26,7 +26,7 @@ ALLOWED_MIB = 16.0
 
 DEFAULTS = (
     *("env=ball_balance", "num_envs=64", "plan.gpus=1", "plan.gmis_per_gpu=2"),
-    *("run.checkpoint_every=200", "run.measure_throughput=false", "num_timesteps=1000000000000"),
+    *("run.checkpoint_every=200", "num_timesteps=1000000000000"),
 )
 
 

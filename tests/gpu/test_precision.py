@@ -18,7 +18,7 @@ def test_the_policy_that_is_updated_is_the_one_that_acted(precision: str, tmp_pa
     done = train(
         *("env=ball_balance", "num_envs=1024", f"num_timesteps={20 * 1024 * 16}"),
         *("algo.num_minibatches=1", "algo.num_updates_per_batch=1", "algo.unroll_length=16"),
-        *(f"algo.precision={precision}", "run.measure_throughput=false", "run.dir=run"),
+        *(f"algo.precision={precision}", "run.dir=run"),
         cwd=tmp_path,
         timeout_s=580.0,
     )

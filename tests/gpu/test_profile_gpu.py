@@ -21,7 +21,7 @@ def test_a_training_goes_on_after_its_trace(impl: str, tmp_path: Path) -> None:
     if impl == "warp":
         pytest.importorskip("warp", reason="warp-lang is not installed")
     size = ("num_envs=4096", "num_timesteps=3e6", "plan.gpus=1", f"physics.impl={impl}")
-    options = ("run.profile=20:25", "run.measure_throughput=false", "run.dir=run")
+    options = ("run.profile=20:25", "run.dir=run")
     done = train("env=ant", *size, *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     run = tmp_path / "run"

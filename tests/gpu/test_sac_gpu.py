@@ -19,7 +19,7 @@ def test_networks_as_large_as_they_are_used_learn(updates: int, tmp_path: Path) 
     done = train(
         *("env=ball_balance", "physics.impl=jax", "algo=sac", "num_envs=1024"),
         *(f"algo.updates_per_step={updates}", f"num_timesteps={20 * 16 * 1024}"),
-        *("run.measure_throughput=false", "run.dir=run"),
+        "run.dir=run",
         cwd=tmp_path,
         timeout_s=580.0,
     )

@@ -11,7 +11,7 @@ pytestmark = [pytest.mark.gpu, pytest.mark.timeout(900)]
 
 TASK = (
     *("env=ball_balance", "physics.impl=jax", f"num_timesteps={40 * 16 * 256}", "sweep.gpus=1"),
-    *("algo.unroll_length=16", "run.measure_throughput=false"),
+    "algo.unroll_length=16",
 )
 TOO_MANY = 1_572_864
 

@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.gpu, pytest.mark.timeout(1200)]
 
 SMALL = (
     *("physics.impl=warp", "num_envs=512", "algo.unroll_length=16", "algo.num_minibatches=4"),
-    *("run.measure_throughput=false", "run.checkpoint_every=0", "run.dir=run"),
+    *("run.checkpoint_every=0", "run.dir=run"),
 )
 ITERATION = 512 * 16
 

@@ -15,7 +15,7 @@ from gmijax.runs.history import read_metrics
 @pytest.mark.parametrize(
     ("overrides", "reached"),
     [
-        (("plan.gpus=2", "num_envs=256", "run.measure_throughput=false"), 120),
+        (("plan.gpus=2", "num_envs=256"), 120),
         (("algo=a3c", "plan.serving_gmis_per_gpu=2", "num_envs=128", "algo.batch_size=256"), 60),
     ],
     ids=["ppo", "a3c"],

@@ -16,7 +16,7 @@ from gmijax.runs.checkpoints import what_is_broken
 
 BASE = (
     *(POINT[0], "num_envs=16", "algo.unroll_length=4", "algo.policy_hidden_layer_sizes=[8]"),
-    *("run.measure_throughput=false", "run.grace_s=3", "run.max_restarts=0"),
+    *("run.grace_s=3", "run.max_restarts=0"),
 )
 
 SAC = (

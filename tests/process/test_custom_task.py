@@ -34,7 +34,7 @@ def make(*, impl, max_envs, settings={"pace": 0.1}):
     return Env(SPEC, (), reset, step, None, lambda state: state.physics)
 """
 SMALL = (
-    *("num_envs=16", "algo.unroll_length=4", "run.measure_throughput=false", "run.grace_s=3"),
+    *("num_envs=16", "algo.unroll_length=4", "run.grace_s=3"),
     "run.max_restarts=0",
     *("algo.policy_hidden_layer_sizes=[8]", "algo.value_hidden_layer_sizes=[8]"),
 )

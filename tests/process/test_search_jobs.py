@@ -20,7 +20,7 @@ TASK = POINT_TASK.replace(
 )
 JOB = (
     *("env=point.py:make", "search.store=store", "algo.unroll_length=4"),
-    *("algo.num_updates_per_batch=1", "run.measure_throughput=false", "run.grace_s=3"),
+    *("algo.num_updates_per_batch=1", "run.grace_s=3"),
     *("algo.policy_hidden_layer_sizes=[8]", "algo.value_hidden_layer_sizes=[8]"),
 )
 GRID = (*("search.gmis_per_gpu=[2,1]", "search.num_envs=[16,24]"),)

@@ -21,7 +21,7 @@ def test_a_task_trains_for_two_iterations(task: str, tmp_path: Path) -> None:
     done = train(
         *(f"env={task}", f"num_envs={NUM_ENVS}", f"num_timesteps={2 * STEPS}", "run.dir=run"),
         *("algo.unroll_length=2", "algo.num_minibatches=2", "algo.num_updates_per_batch=1"),
-        *("run.measure_throughput=false", "physics.impl=jax"),
+        "physics.impl=jax",
         cwd=tmp_path,
     )
     assert done.returncode == 0, done.stderr

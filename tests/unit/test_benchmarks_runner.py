@@ -186,7 +186,7 @@ class Commands:
         self.run(command, folder)
 
 
-SWEEP = ["-m", "gmijax.sweep", "run.measure_throughput=false"]
+SWEEP = ["-m", "gmijax.sweep"]
 BENCHMARKS: dict[str, tuple[list[str], str, list[list[str]]]] = {
     "run": (
         ["lgr-ant", "--only", "2G2T mpr", "--repeats", "1"],
@@ -195,7 +195,7 @@ BENCHMARKS: dict[str, tuple[list[str], str, list[list[str]]]] = {
             [
                 *("-m", "gmijax.train", "env=ant", "num_envs=2048", "num_timesteps=3145728"),
                 *("plan.gpus=2", "plan.gmis_per_gpu=2", "plan.backend=mps", "reduce.strategy=mpr"),
-                *("run.measure_throughput=false", "run.checkpoint_every=0"),
+                "run.checkpoint_every=0",
             ]
         ],
     ),
