@@ -148,11 +148,9 @@ def plain_data(outcome: SearchOutcome, reason: str, split: Split | None = None) 
 def draw(outcome: SearchOutcome, picture: Path, title: str) -> None:
     """Draws throughput of a GPU and memory of a GMI over environments, a line per GMIs per GPU."""
     # Imported here: it costs half a second that no other use of this module should pay.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 4), layout="constrained")
-    FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     rows = sorted({one.point._replace(num_envs=0) for one in outcome.visited})
     impls = sorted({row.impl for row in rows})
