@@ -15,6 +15,7 @@ from rich.table import Table
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
 from gmijax.autotune.search import SearchOutcome, SearchPoint
 from gmijax.autotune.workloads import Split
+from gmijax.runs.names import counted
 from gmijax.supervise.watched_gmi import GmiStatus
 
 _LONGEST_REASON = 90
@@ -207,14 +208,14 @@ def _answer(top: SearchPoint, split: Split | None) -> str:
     point = top.point
     envs = f"{point.num_envs} environments each"
     if not point.trainers:
-        return f"{_count(point.gmis_per_gpu, 'GMI')} per GPU with {envs}"
-    serving = f"{_count(point.gmis_per_gpu, 'serving GMI')}"
-    training = f"{_count(point.trainers, 'training GMI')}"
+        return f"{counted(point.gmis_per_gpu, 'GMI')} per GPU with {envs}"
+    serving = counted(point.gmis_per_gpu, "serving GMI")
+    training = counted(point.trainers, "training GMI")
     if split is None:
         return f"{serving} with {envs} and {training} per GPU"
     return (
-        f"{_count(split.serving, 'GPU')} with {serving} of {envs}, "
-        f"{_count(split.training, 'GPU')} with {training}"
+        f"{counted(split.serving, 'GPU')} with {serving} of {envs}, "
+        f"{counted(split.training, 'GPU')} with {training}"
     )
 
 
@@ -226,10 +227,6 @@ def _reason_of(split: Split, top: SearchPoint) -> str:
         f" (projected from one GPU of each kind: agents could make {acting:,.0f}, trainers learn "
         f"from {learning:,.0f}; with so many GPUs {slower} are the slower side)"
     )
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number > 1)}"
 
 
 def _where(point: Point) -> dict[str, Any]:
