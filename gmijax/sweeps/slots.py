@@ -125,10 +125,6 @@ class SlotPool:
         self._limits: dict[tuple[int, int], int] = {}
         self.left = set(range(len(sites)))
 
-    def has_free_slot(self, avoid: Collection[int] = ()) -> bool:
-        """Whether any slot is free on machines other than those of `avoid`."""
-        return self.num_gpus_with_free_slot(avoid) > 0
-
     def num_gpus_with_free_slot(self, avoid: Collection[int] = ()) -> int:
         """GPUs that have a free slot, on machines other than those of `avoid`."""
         return sum(len(self._open_slots(site)) for site in self.left.difference(avoid))
