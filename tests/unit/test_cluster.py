@@ -133,30 +133,27 @@ def test_without_ray_or_a_cluster_the_line_says_what_to_do(
         RayCluster(ClusterConfig(), Node)
 
 
+NO_ADDRESSES = (
+    *("somewhere", "9" * 30, "head:" + "9" * 5000, "head:65536", "head:0", ":6379"),
+    *("head:\N{SUPERSCRIPT TWO}", "head:\N{ARABIC-INDIC DIGIT SIX}379", "head:6379\n"),
+)
+NO_HOSTS = ("a" * 100, "head\0", "..", "\udc80")
+
+
 @pytest.mark.parametrize(
-    "address",
+    ("address", "message"),
     [
-        *("somewhere", "9" * 30, "head:" + "9" * 5000, "head:65536", "head:0", ":6379"),
-        *("head:\N{SUPERSCRIPT TWO}", "head:\N{ARABIC-INDIC DIGIT SIX}379", "head:6379\n"),
+        *((one, "expected auto, local or host:port with a port from 1") for one in NO_ADDRESSES),
+        *((f"{host}:6379", "nothing answers there") for host in NO_HOSTS),
     ],
 )
 def test_an_address_that_cannot_be_is_refused(
-    address: str, monkeypatch: pytest.MonkeyPatch
+    address: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ray = SimpleNamespace(is_initialized=lambda: False)
     monkeypatch.setattr(ray_nodes, "import_ray", lambda: ray)
-    with pytest.raises(ConfigError, match=r"expected auto, local or host:port with a port from 1"):
+    with pytest.raises(ConfigError, match=message):
         RayCluster(ClusterConfig(address=address), Node)
-
-
-@pytest.mark.parametrize("host", ["a" * 100, "head\0", "..", "\udc80"])
-def test_a_name_of_a_host_that_cannot_be_is_one_nobody_answers_at(
-    host: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ray = SimpleNamespace(is_initialized=lambda: False)
-    monkeypatch.setattr(ray_nodes, "import_ray", lambda: ray)
-    with pytest.raises(ConfigError, match="nothing answers there"):
-        RayCluster(ClusterConfig(address=f"{host}:6379"), Node)
 
 
 def test_a_cluster_for_one_job_has_a_token_of_its_own_and_is_for_this_machine_alone(
