@@ -225,8 +225,7 @@ def _by_gpu(allocations: Iterable[Allocation]) -> dict[int, list[Allocation]]:
 
 def _labels(site: Site) -> dict[int, str]:
     """Label of every slot, by GMI id."""
-    index_of = {gpu.uuid: gpu.index for gpu in site.machine.gpus}
-    index_of |= {one.uuid: gpu.index for gpu in site.machine.gpus for one in gpu.instances}
+    index_of = site.machine.index_of_device
     node = f"{site.name} " if site.name else ""
     labels: dict[int, str] = {}
     for here in _by_gpu(site.plan.allocations).values():
