@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from benchmarks.evaluation.node_tables import ONE_NODE, TWO_NODES
 from benchmarks.two_ray_nodes import RAY
+from gmijax.runs.names import counted
 
 _SOCKETS = {f"NCCL_{way}_DISABLE": "1" for way in ("P2P", "SHM", "IB")}
 _SAYS = {"NCCL_DEBUG": "INFO"}
@@ -51,7 +52,7 @@ class Case(NamedTuple):
     def job(self) -> str:
         """What is the same on one node and on two."""
         if self.verb == "train":
-            return f"{self.each} {'GMI' if self.each == 1 else 'GMIs'} on each GPU"
+            return f"{counted(self.each, 'GMI')} on each GPU"
         return f"{self.verb}, {self.each} on each GPU"
 
 

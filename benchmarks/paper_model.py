@@ -1,10 +1,9 @@
-"""The paper's resource model of templates (section 5.1, Tables 3 and 4, equations 1 to 3); no jax.
+"""The paper's resource model of templates: section 5.1, Tables 4 and 5, equations 2 and 3. No jax.
 
 The letters are the paper's: R_s, R_a, R_t the size of the dominant resource that simulator, agent
-and trainer need, T_s, T_a, T_t the seconds that they take in one iteration, S, A, W the bytes of
-a state, an action and a reward, M_p those of the parameters, m simulation steps before a
-training, n GMIs, BW bytes a second between GMIs. `alpha` and `beta` say which part of an agent
-and of a trainer one simulator needs, where several simulators share them.
+and trainer need, T_s, T_a, T_t the seconds that they take in one iteration, COM the bytes that an
+iteration moves between GMIs, BW bytes a second between GMIs. `alpha` and `beta` say which part of
+an agent and of a trainer one simulator needs, where several simulators share them.
 
 Two templates are compared by their throughput: `throughput` of the one over that of the other.
 The price of co-location is in R (a GMI holds the largest of its tasks all the time), the price of
@@ -13,7 +12,7 @@ separation in COM.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from gmijax.errors import ConfigError
 
@@ -32,40 +31,6 @@ class Task(NamedTuple):
 
 NOTHING = Task(0.0, 0.0)
 """The trainer of a serving job."""
-
-
-class Sizes(NamedTuple):
-    """Bytes that an iteration may move between GMIs.
-
-    Attributes:
-      state: S, of all environments of a GMI.
-      action: A.
-      reward: W.
-      parameters: M_p.
-    """
-
-    state: float
-    action: float
-    reward: float
-    parameters: float = 0.0
-
-
-def dominant_resource(
-    sms: float, sms_per_gpu: float, memory: float, memory_per_gpu: float
-) -> Literal["sm", "memory"]:
-    """Equation 1: the resource of which one process alone on a GPU uses the larger part.
-
-    Args:
-      sms: R_SM, e.g. mean utilisation times the GPU's SMs.
-      sms_per_gpu: of the whole GPU.
-      memory: R_Mem, in any unit.
-      memory_per_gpu: of the whole GPU, in the same unit.
-
-    Raises:
-      ConfigError: a GPU without SMs or memory.
-    """
-    _require_positive(sms_per_gpu=sms_per_gpu, memory_per_gpu=memory_per_gpu)
-    return "sm" if sms / sms_per_gpu >= memory / memory_per_gpu else "memory"
 
 
 def tdg_resource(simulator: Task, agent: Task, alpha: float) -> float:
@@ -98,22 +63,6 @@ def tdg_ex_resource(
 def tcg_ex_resource(simulator: Task, agent: Task, trainer: Task) -> float:
     """Table 5, TCG_EX: (T_s + T_a + T_t) max(R_s, R_a, R_t) / (T_s + T_a + T_t)."""
     return max(simulator.resource, agent.resource, trainer.resource)
-
-
-def tdg_bytes(sizes: Sizes) -> float:
-    """Table 4, COM of TDG: 2 S + A + W. That of TCG is 0."""
-    return 2 * sizes.state + sizes.action + sizes.reward
-
-
-def tdg_ex_bytes(sizes: Sizes, steps: int, num_gmis: int) -> float:
-    """Table 5, COM of TDG_EX: m (S + A + W) + M_p + 2 (n - 1) M_p / n."""
-    experience = steps * (sizes.state + sizes.action + sizes.reward)
-    return experience + sizes.parameters + tcg_ex_bytes(sizes, num_gmis)
-
-
-def tcg_ex_bytes(sizes: Sizes, num_gmis: int) -> float:
-    """Table 5, COM of TCG_EX: 2 (n - 1) M_p / n, the reduction of gradients."""
-    return 2 * (num_gmis - 1) * sizes.parameters / num_gmis
 
 
 def throughput(all_resource: float, resource: float, work_s: float, com_s: float) -> float:

@@ -38,7 +38,7 @@ COMMIT_VARIABLE = "GMIJAX_COMMIT"
 _ROOT = Path(__file__).parents[1]
 _MEASURED = ("gmijax", "configs", "benchmarks", ":!benchmarks/results")
 _OPTIONAL = ("warp-lang", "nccl4py", "cuda-bindings", "optuna", "brax", "playground")
-_VERSIONS = (*REQUIRED, *_OPTIONAL)
+_VERSIONS = ("python", *REQUIRED, *_OPTIONAL)
 _SAME = ("commit", "is_dirty", "host", "device", "driver", "versions")
 """What must be equal for a call to be gone on with."""
 
@@ -202,7 +202,7 @@ def _begin(settings: Mapping[str, Any], device: str | None) -> Call:
         host=f"{platform.node()}, {os.cpu_count()} cores, {platform.platform()}",
         device=device or ", ".join(f"{n} x {name}" for name, n in counts.items()) or CPU,
         driver=machine.driver_version,
-        versions={"python": platform.python_version(), **versions_of(_VERSIONS)},
+        versions=versions_of(_VERSIONS),
         command=shlex.join(["python", *sys.orig_argv[1:]]),
         settings={key: _plain(value) for key, value in settings.items()},
         results={},

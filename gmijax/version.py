@@ -1,7 +1,8 @@
-"""The version of gmijax, from which the distribution takes it, and of other packages."""
+"""The version of gmijax, from which the distribution takes it, and of Python and packages."""
 
 from __future__ import annotations
 
+import platform
 import re
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, requires, version
@@ -10,14 +11,19 @@ __version__ = "0.1.0"
 
 
 def versions_of(packages: Iterable[str]) -> dict[str, str | None]:
-    """Versions of installed packages by name, None for what is not installed."""
-    found: dict[str, str | None] = {}
-    for name in packages:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = None
-    return found
+    """Versions of `gmijax`, `python` and packages by name, None for what is not installed."""
+    return {package: _version_of(package) for package in packages}
+
+
+def _version_of(package: str) -> str | None:
+    if package == "gmijax":
+        return __version__  # Of the code that runs, which need not be what is installed.
+    if package == "python":
+        return platform.python_version()
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def numbers_of(number: str | None) -> tuple[int, ...]:

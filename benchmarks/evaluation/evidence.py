@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from benchmarks.records import Call
+from gmijax.runs.names import counted
 
 LEAST = 3
 """Runs of each case that a reader may ask for."""
@@ -52,9 +53,8 @@ class Evidence(NamedTuple):
 
     def __str__(self) -> str:
         gpus = sorted({one.gpu for one in self.sources if one.gpu})
-        runs = "1 run" if self.repeats == 1 else f"{self.repeats} runs"
         unknown = [] if self.has_origin else ["commit unknown"]
-        return ", ".join([" and ".join(gpus) or "CPU", runs, *unknown])
+        return ", ".join([" and ".join(gpus) or "CPU", counted(self.repeats, "run"), *unknown])
 
 
 class Ratio(float):

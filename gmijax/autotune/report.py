@@ -15,6 +15,7 @@ from rich.table import Table
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
 from gmijax.autotune.search import SearchOutcome, SearchPoint
 from gmijax.autotune.workloads import Split
+from gmijax.runs.names import counted
 from gmijax.supervise.watched_gmi import GmiStatus
 
 _LONGEST_REASON = 90
@@ -148,11 +149,9 @@ def plain_data(outcome: SearchOutcome, reason: str, split: Split | None = None) 
 def draw(outcome: SearchOutcome, picture: Path, title: str) -> None:
     """Draws throughput of a GPU and memory of a GMI over environments, a line per GMIs per GPU."""
     # Imported here: it costs half a second that no other use of this module should pay.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 4), layout="constrained")
-    FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     rows = sorted({one.point._replace(num_envs=0) for one in outcome.visited})
     impls = sorted({row.impl for row in rows})
@@ -209,14 +208,14 @@ def _answer(top: SearchPoint, split: Split | None) -> str:
     point = top.point
     envs = f"{point.num_envs} environments each"
     if not point.trainers:
-        return f"{_count(point.gmis_per_gpu, 'GMI')} per GPU with {envs}"
-    serving = f"{_count(point.gmis_per_gpu, 'serving GMI')}"
-    training = f"{_count(point.trainers, 'training GMI')}"
+        return f"{counted(point.gmis_per_gpu, 'GMI')} per GPU with {envs}"
+    serving = counted(point.gmis_per_gpu, "serving GMI")
+    training = counted(point.trainers, "training GMI")
     if split is None:
         return f"{serving} with {envs} and {training} per GPU"
     return (
-        f"{_count(split.serving, 'GPU')} with {serving} of {envs}, "
-        f"{_count(split.training, 'GPU')} with {training}"
+        f"{counted(split.serving, 'GPU')} with {serving} of {envs}, "
+        f"{counted(split.training, 'GPU')} with {training}"
     )
 
 
@@ -228,10 +227,6 @@ def _reason_of(split: Split, top: SearchPoint) -> str:
         f" (projected from one GPU of each kind: agents could make {acting:,.0f}, trainers learn "
         f"from {learning:,.0f}; with so many GPUs {slower} are the slower side)"
     )
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number > 1)}"
 
 
 def _where(point: Point) -> dict[str, Any]:

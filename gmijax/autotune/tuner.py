@@ -22,12 +22,12 @@ from gmijax.autotune.report import SearchDisplay, draw, plain_data, table, verdi
 from gmijax.autotune.search import OutOfBudget, Rules, SearchOutcome, SearchPoint
 from gmijax.autotune.store import ProfileStore
 from gmijax.autotune.workloads import (
+    VERSIONS,
     C,
     ServeWorkload,
     Split,
     SynchronousWorkload,
     Workload,
-    installed_versions,
 )
 from gmijax.clock import running_s
 from gmijax.config import AUTO, ServeConfig, TrainConfig
@@ -39,6 +39,7 @@ from gmijax.partition.layout import Layout
 from gmijax.runs.folder import RunPaths, create_run, write_json
 from gmijax.runs.names import nearby
 from gmijax.sim.impl import choose_impl
+from gmijax.version import versions_of
 
 _ORDERS: Final = MappingProxyType(
     {"coarse_first": "gmijax.autotune.search", "as_printed": "gmijax.baselines.algorithm2"}
@@ -160,7 +161,7 @@ class Search:
             "wall_s": time.monotonic() - started_s,
             "num_profiled": self._num_profiled,
             "store": str(self._store.path),
-            "versions": installed_versions(),
+            "versions": versions_of(VERSIONS),
         }
         self._console.print(table(outcome))
         self._console.print(reason)  # Before the files, for which there may be no room.

@@ -28,11 +28,12 @@ from gmijax.runs.history import read_metrics
 from gmijax.runs.result import TrainResult
 from gmijax.supervise.job_kinds import JobKind, serving_kind, training_kind
 from gmijax.supervise.watched_gmi import GmiStatus
-from gmijax.version import __version__, versions_of
+from gmijax.version import versions_of
 
 C = TypeVar("C", TrainConfig, ServeConfig)
 
-_VERSIONS: Final = ("jax", "jaxlib", "mujoco-mjx", "warp-lang")
+VERSIONS: Final = ("gmijax", "jax", "jaxlib", "mujoco-mjx", "warp-lang")
+"""What decides with the machine and the configuration how fast a job is."""
 
 
 class Split(NamedTuple):
@@ -160,7 +161,7 @@ class Workload(ABC, Generic[C]):
             "reduce": reduce,
             "mps": machine.mps_control is not None,
             "driver": machine.driver_version,
-            "versions": installed_versions(),
+            "versions": versions_of(VERSIONS),
             **self.key,
         }
 
@@ -259,8 +260,3 @@ def peak_memory_mib(results: Sequence[Mapping[str, Any]]) -> float:
     """The largest peak of any GMI, as its allocator counts; on the CPU, of the process."""
     devices = [result["device"] for result in results if "device" in result]
     return max(float(one["peak_memory_mib"] or one["peak_host_memory_mib"]) for one in devices)
-
-
-def installed_versions() -> dict[str, str | None]:
-    """Versions of what computes, None for what is not installed."""
-    return {"gmijax": __version__, **versions_of(_VERSIONS)}

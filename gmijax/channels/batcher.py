@@ -28,7 +28,7 @@ class Batcher:
 
     A batch that lies in one transfer is a slice of it, without a copy, and holds its memory until
     the next batch is asked for. Otherwise rollouts are stacked in what `new_stack` makes.
-    It counts `batches` given out, `unrolls` and `transfers` that arrived.
+    It counts `batches` given out and `unrolls` that arrived.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Batcher:
         new_stack: Callable[[Spec, int], Stack],
         held: contextlib.ExitStack,
     ) -> None:
-        self.batches = self.unrolls = self.transfers = 0
+        self.batches = self.unrolls = 0
         self._rank = rank
         self._sources = list(sources)
         self._turn = 0
@@ -134,7 +134,6 @@ class Batcher:
     def _read(self, reader: ChannelReader, decode: Decode) -> Rollouts | None:
         """The next transfer, valid until the reader's `release`; PipeClosed if none can come."""
         while (message := reader.try_get()) is not None:
-            self.transfers += 1
             if (rollouts := decode(message, reader.peer)) is not None:
                 return rollouts
         return None

@@ -11,11 +11,12 @@ from contextlib import suppress
 from pathlib import Path
 
 from gmijax.clock import running_s
-from gmijax.cluster.node import ON_GPUS, Facts, own_versions
+from gmijax.cluster.node import COMPARED, ON_GPUS, Facts
 from gmijax.cluster.ray_nodes import NodeHandle
 from gmijax.errors import ConfigError
 from gmijax.machine.differences import differences_in
 from gmijax.machine.snapshot import Machine
+from gmijax.version import versions_of
 
 SHOWS_S = 20.0
 """Network file systems show what others have written late, some after seconds."""
@@ -45,7 +46,7 @@ def differences_in_versions(nodes: Mapping[str, Facts]) -> list[str]:
 def require_alike(joined: Sequence[NodeHandle]) -> None:
     """Raises ConfigError if nodes differ in versions from this machine, or for GPUs in between."""
     # This machine may have no GPUs: it does not use them.
-    here = Facts("", Machine((), ()), own_versions())
+    here = Facts("", Machine((), ()), versions_of(COMPARED))
     nodes = {name: node.facts for name, node in by_name(joined).items()}
     if problems := differences_in_versions({"this machine": here, **nodes}):
         raise ConfigError(f"cluster.engine=ray: {problems[0]}; all nodes must have the same")

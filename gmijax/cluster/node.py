@@ -43,14 +43,17 @@ from gmijax.supervise.run_gmis import drop_unreadable, shared_blocks
 from gmijax.supervise.start_gmi import Launch, StartGmi, start_gmi
 from gmijax.version import __version__, versions_of
 
-COMPARED: Final = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax")
-"""Packages whose versions all nodes must have alike, beside Python and gmijax."""
-
 ON_GPUS: Final = (
     *("jax-cuda12-plugin", "jax-cuda13-plugin", "nvidia-nccl-cu12", "nvidia-nccl-cu13"),
     *("cuda-bindings", "nccl4py", "warp-lang"),
 )
-"""The same for nodes whose GPUs are used; the controller may be on a machine without any."""
+"""Packages that compute on GPUs; the controller may be on a machine without any."""
+
+COMPARED: Final = (
+    *("gmijax", "python", "jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax"),
+    *ON_GPUS,
+)
+"""What all nodes must have in the same version, `ON_GPUS` where GPUs are used."""
 
 Order = Literal["ask_to_stop", "order_end", "end_as_done", "kill"]
 """Methods of a `GmiProcess` that the controller may call."""
@@ -64,7 +67,7 @@ class Facts(NamedTuple):
     Attributes:
       address: IP address for the exchange with other nodes.
       machine: what it has.
-      versions: of all that computes, by package; see `own_versions`.
+      versions: of all that computes, by package; see `COMPARED`.
     """
 
     address: str
@@ -128,7 +131,7 @@ class Node:
             return f"cluster.engine=ray: {differ[0]}; all nodes must have the same"
         try:
             address = address_of(self._interface) if self._interface else self._address
-            return Facts(address, detect_machine(), own_versions())
+            return Facts(address, detect_machine(), versions_of(COMPARED))
         except GmijaxError as error:
             return str(error)
 
@@ -271,15 +274,6 @@ class TrainingNode(Node):
         if self._launch is not None:
             drop_unreadable(self._launch.run, self._started)
         self._held.close()
-
-
-def own_versions() -> dict[str, str | None]:
-    """Versions of all that computes, on this machine."""
-    return {
-        "gmijax": __version__,
-        "python": platform.python_version(),
-        **versions_of((*COMPARED, *ON_GPUS)),
-    }
 
 
 def address_of(interface: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from gmijax.partition.reduction import (
 )
 from gmijax.sim.impl import ON_GPU, choose_impl
 from gmijax.sim.registry import SUITES, require_task, task_names
-from gmijax.version import __version__, numbers_of
+from gmijax.version import numbers_of, versions_of
 
 _CUDA_13_DRIVER: Final = 580
 """CUDA 13 needs a driver of this branch."""
@@ -61,8 +60,7 @@ class Diagnosis:
         machine = self.system.machine
         return {
             "ok": not self.problems,
-            "gmijax": __version__,
-            "python": sys.version.split()[0],
+            **versions_of(("gmijax", "python")),
             "cpu_cores": len(machine.cpu_cores),
             "driver": machine.driver_version,
             "gpus": [

@@ -53,7 +53,7 @@ class _Member(NamedTuple):
     folder: OpenFolder
 
 
-def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = False) -> None:
+def train_packed(configs: Sequence[TrainConfig], folder: Path) -> None:
     """Trains with all configurations at once; returns when all have ended.
 
     A run whose numbers are no longer finite ends before the others, and has an `error.json`
@@ -62,7 +62,6 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
     Args:
       configs: they differ in seed, learning rate and run folder alone, and begin at the same step.
       folder: for the files of the GMI.
-      show: print the plan, live progress and the outcomes.
 
     Raises:
       ConfigError: bad input, before anything was started.
@@ -71,7 +70,7 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
     """
     started_s = time.monotonic()
     start_points = [find_start_point(config) for config in configs]
-    console = open_console(show=show)
+    console = open_console(show=True)
     config, plan, machine, reasons = decide(configs[0], console)
     for start_point in start_points:
         require_replay_fits(config, plan, start_point.checkpoint)

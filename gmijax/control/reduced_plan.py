@@ -64,16 +64,14 @@ def _lost(plan: Plan, machine: Machine) -> set[int]:
     """Positions in the job of the GPUs that the machine no longer has."""
     if plan.backend == "cpu":
         return set()
-    present = {gpu.uuid for gpu in machine.gpus}
-    present |= {one.uuid for gpu in machine.gpus for one in gpu.instances}
+    present = machine.index_of_device
     return {allocation.gpu for allocation in plan.allocations if allocation.device not in present}
 
 
 def _without(config: TrainConfig, plan: Plan, machine: Machine, lost: set[int]) -> PlanConfig:
     """The user's wishes for the GPUs that are left, which keep their indices."""
     kept = [position for position in range(plan.layout.num_gpus) if position not in lost]
-    index_of = {gpu.uuid: gpu.index for gpu in machine.gpus}
-    index_of |= {one.uuid: gpu.index for gpu in machine.gpus for one in gpu.instances}
+    index_of = machine.index_of_device
     device_of = {allocation.gpu: allocation.device for allocation in plan.allocations}
     gpus = tuple(index_of[device_of[position]] for position in kept)
     rows = config.plan.layout

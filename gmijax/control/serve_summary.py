@@ -11,12 +11,13 @@ import numpy as np
 from gmijax.config import ServeConfig
 from gmijax.control.console import nearby
 from gmijax.control.display import clock
-from gmijax.control.summary import Data, own_versions, plan_data
+from gmijax.control.summary import Data, plan_data
 from gmijax.learning.physics_health import overflow_warnings
 from gmijax.partition.plan import Plan
 from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
+from gmijax.version import versions_of
 
 
 def serve_summary(
@@ -49,7 +50,7 @@ def serve_summary(
         "diverged_steps": sum(result.get("diverged_steps") or 0 for result in collecting),
         "overflow_steps": _sums([result.get("overflow_steps") or {} for result in collecting]),
         "gmis": [_of_gmi(gmi, plan, result) for gmi, result in found.items()],
-        "versions": own_versions(),
+        "versions": versions_of(("gmijax", "python")),
         "device": next((r["device"] for r in found.values() if "device" in r), None),
         "impl": config.physics.impl,
     }

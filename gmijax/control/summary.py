@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,12 @@ from gmijax.runs.history import read_metrics
 from gmijax.runs.names import by_steps
 from gmijax.runs.ranking import best_checkpoint
 from gmijax.runs.result import TrainResult
-from gmijax.version import __version__, versions_of
+from gmijax.version import versions_of
 
-_VERSIONS = ("jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
+_VERSIONS = (
+    *("gmijax", "python", "jax", "jaxlib", "mujoco-mjx"),
+    *("flax", "optax", "orbax-checkpoint"),
+)
 
 EXPLORING = "(with exploration noise, mean of the latest episodes)"
 """What the return is that a job prints while it trains."""
@@ -60,7 +62,7 @@ def train_summary(
         "overflow_steps": {} if result is None else dict(result.overflow_steps),
         "checkpoint": str(checkpoints[-1]) if checkpoints else None,
         "restarts": list(restarts),
-        "versions": own_versions() | versions_of(_VERSIONS),
+        "versions": versions_of(_VERSIONS),
         "device": None if result is None else dict(result.device),
         "impl": config.physics.impl,
     }
@@ -196,8 +198,3 @@ def plan_data(plan: Plan) -> dict[str, Any]:
         "template": plan.template,
         "roles": list(plan.roles),
     }
-
-
-def own_versions() -> dict[str, str | None]:
-    """Versions of gmijax and of Python."""
-    return {"gmijax": __version__, "python": sys.version.split()[0]}

@@ -16,7 +16,7 @@ import jax
 
 from gmijax.collectives.interface import Collectives
 from gmijax.config import AlgoConfig
-from gmijax.learning.learner import Learner, LearnerState
+from gmijax.learning.learner import Learner
 from gmijax.learning.unroll import Counts
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState
@@ -57,28 +57,6 @@ the fields of a `TrainState` that acting needs, and comes out equal on all GMIs,
 into it passes through `collectives`. `memory` is a GMI's own."""
 
 
-def _environments(learner: Learner[Any], env: BatchedEnv, envs: BatchState) -> BatchState:
-    del learner, env
-    return envs
-
-
-def _itself(memory: Any) -> BatchState:
-    return memory
-
-
-def _unchanged(memory: Any, replay: None) -> Any:
-    del replay
-    return memory
-
-
-def _no_replay(learner: Learner[Any], memory: Any) -> None:
-    del learner, memory
-
-
-def _params(state: LearnerState) -> PyTree:
-    return state.params
-
-
 @dataclass(frozen=True)
 class Algorithm:
     """An algorithm for jobs in which every GMI simulates, acts and trains.
@@ -101,11 +79,11 @@ class Algorithm:
     init: Callable[[Learner[Any], int, PRNGKey], Any]
     iterate: Iterate
     num_averaged: Callable[[EnvSpec, Any], int]
-    begin: Callable[[Learner[Any], BatchedEnv, BatchState], Any] = _environments
-    envs: Callable[[Any], BatchState] = _itself
-    replay: Callable[[Learner[Any], Any], PyTree | None] = _no_replay
-    with_replay: Callable[[Any, PyTree], Any] = _unchanged
-    learned: Callable[[Any], PyTree] = _params
+    begin: Callable[[Learner[Any], BatchedEnv, BatchState], Any] = lambda _, __, envs: envs
+    envs: Callable[[Any], BatchState] = lambda memory: memory
+    replay: Callable[[Learner[Any], Any], PyTree | None] = lambda _, __: None
+    with_replay: Callable[[Any, PyTree], Any] = lambda memory, _: memory
+    learned: Callable[[Any], PyTree] = lambda state: state.params
 
 
 def load_algorithm(config: AlgoConfig) -> Algorithm:

@@ -109,8 +109,7 @@ def require_disk_for(run: RunPaths, replay: PyTree | None, num_gmis: int) -> Non
 
     `replay` may be shapes and dtypes; None: there is none to be saved.
     """
-    leaves = jax.tree.leaves(replay)
-    need = num_gmis * sum(leaf.size * leaf.dtype.itemsize for leaf in leaves) / 2**20
+    need = num_gmis * saved_arrays.size_bytes(replay) / 2**20
     if need and need > (free := shutil.disk_usage(run.root).free / 2**20):
         raise ConfigError(
             f"algo.save_replay=true: the replays take {need:,.0f} MiB at the end, and the disk of "

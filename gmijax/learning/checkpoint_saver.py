@@ -54,7 +54,7 @@ class CheckpointSaver:
 
     def __init__(self, gmi: int, comm: Communicator, keep: int | None) -> None:
         self._gmi, self._comm, self._keep = gmi, comm, keep
-        self._thread = ReportThread(_call)
+        self._thread = ReportThread(lambda work: work())
         self._unnamed: Sequence[CheckpointPart] = ()
         self.last_steps: int | None = None
 
@@ -114,7 +114,3 @@ class CheckpointSaver:
 
     def _barrier(self) -> None:
         self._comm.all_gather(np.zeros(1, np.float32))
-
-
-def _call(work: Callable[[], Any]) -> None:
-    work()

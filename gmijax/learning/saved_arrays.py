@@ -71,6 +71,11 @@ def on_host(tree: T) -> T:
     return jax.tree.map(lambda leaf: np.array(_without_key(leaf)), tree)
 
 
+def size_bytes(tree: PyTree) -> int:
+    """What arrays, or their shapes and dtypes, take in memory."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
 @contextmanager
 def _plain_path(folder: Path) -> Iterator[Path]:
     """A path of a folder, which need not be there yet, without any but plain characters.

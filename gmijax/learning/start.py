@@ -24,6 +24,7 @@ from gmijax.learning.checkpoint import (
 )
 from gmijax.learning.episode_window import EpisodeWindow
 from gmijax.learning.learner import Learner, TrainState, init_learner
+from gmijax.learning.saved_arrays import size_bytes
 from gmijax.machine.host_limits import detect_host
 from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.saved_config import saved_config
@@ -200,10 +201,10 @@ def begin_episodes(
     init = jax.jit(env.init)
     # Before anything of that size is made. It is traced once: the call below finds it.
     keys = jax.ShapeDtypeStruct((num_envs,), key.dtype)
-    state = jax.tree.leaves(init.eval_shape(env.model, keys))
+    state = init.eval_shape(env.model, keys)
     step_bytes = kept_itemsize * (env.spec.obs_size + env.spec.action_size)
     step_bytes += jnp.dtype(jnp.float32).itemsize  # The reward.
-    env_bytes = num_runs * sum(leaf.size * leaf.dtype.itemsize for leaf in state)
+    env_bytes = num_runs * size_bytes(state)
     all_step_bytes = num_runs * num_envs * step_bytes
     least_bytes = env_bytes + kept_steps * all_step_bytes
     limit_bytes = _memory_bytes()

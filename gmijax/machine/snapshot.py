@@ -72,6 +72,12 @@ class Machine:
         return self.daemons.get(device, self.operator_daemon)
 
     @property
+    def index_of_device(self) -> dict[str, int]:
+        """Index of the GPU by UUID, its own or that of one of its MIG instances."""
+        whole = {gpu.uuid: gpu.index for gpu in self.gpus}
+        return whole | {one.uuid: gpu.index for gpu in self.gpus for one in gpu.instances}
+
+    @property
     def capabilities(self) -> str:
         """Compute capabilities of its GPUs, in words."""
         found = sorted({gpu.compute_capability for gpu in self.gpus})

@@ -130,8 +130,8 @@ class CommandKind:
         output = OutputReader(log, begins)
         events = None
         if settings.tag is not None:
-            events = EventReader(run_dir, settings.tag, time.time(), running_s)
-        progress = ProgressReader(output, self._own, running_s(), running_s, events)
+            events = EventReader(run_dir, settings.tag, time.time())
+        progress = ProgressReader(output, self._own, running_s(), events)
         # On CPU cores alone nothing is compiled that others could use.
         mark = mark_of(job, self._names[slot.site]) if slot.devices else None
         reader = Recorder(progress, run.metrics, mark)

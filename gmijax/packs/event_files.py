@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import struct
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
+from gmijax.clock import running_s
 from gmijax.packs.trainers import Report
 
 _FILES: Final = "events.out.tfevents.*"
@@ -35,7 +35,7 @@ class EventReader:
     """
 
     def __init__(
-        self, folder: Path, tag: str, since_s: float, clock: Callable[[], float] = time.monotonic
+        self, folder: Path, tag: str, since_s: float, clock: Callable[[], float] = running_s
     ) -> None:
         self._folder, self._tag, self._since_s, self._clock = folder, tag, since_s, clock
         self._searched_s: float | None = None

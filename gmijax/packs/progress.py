@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 import re
-import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
+from gmijax.clock import running_s
 from gmijax.config.pack import METRIC
 from gmijax.errors import ConfigError
 from gmijax.packs.event_files import EventReader
@@ -72,9 +72,9 @@ class ProgressReader:
       output: its lines.
       own: the user's expressions; they are read beside a known family, and win over it.
       started_s: when the process started, by the same clock.
-      clock: seconds.
       events: its TensorBoard files. Their values are the metric; their steps count where the
         output names none.
+      clock: seconds.
     """
 
     def __init__(
@@ -82,8 +82,8 @@ class ProgressReader:
         output: OutputReader,
         own: OwnPatterns | None,
         started_s: float,
-        clock: Callable[[], float] = time.monotonic,
         events: EventReader | None = None,
+        clock: Callable[[], float] = running_s,
     ) -> None:
         self._output, self._own, self._events = output, own, events
         self._started_s, self._clock = started_s, clock

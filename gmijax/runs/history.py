@@ -99,11 +99,9 @@ def draw_returns(metrics: Path, picture: Path, title: str) -> None:
     if not training and not evaluations:
         return
     # Imported here: it costs half a second that no other use of this module should pay.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     axes.plot(*zip(*training, strict=True), label="training")
     if evaluations:

@@ -11,26 +11,8 @@ from gmijax.config import SacConfig
 from gmijax.learning.learner import Learner
 from gmijax.learning.policy import ActorCriticParams
 from gmijax.sac.critics import Critics, projected
+from gmijax.sac.replay import Transitions
 from gmijax.types import Array, PRNGKey, PyTree
-
-
-class Batch(NamedTuple):
-    """Transitions [B] as the losses take them.
-
-    Attributes:
-      obs: [B, O], normalised.
-      action: [B, A].
-      reward: [B], of one or several steps, scaled.
-      discount, is_known: [B], see `gmijax.sac.replay.Transitions`.
-      next_obs: [B, O], normalised.
-    """
-
-    obs: Array
-    action: Array
-    reward: Array
-    discount: Array
-    is_known: Array
-    next_obs: Array
 
 
 class CriticFigures(NamedTuple):
@@ -54,7 +36,7 @@ def sampled_action(
 def target_probs(
     critics: Critics,
     targets: PyTree,
-    batch: Batch,
+    batch: Transitions,
     next_action: Array,
     next_log_prob: Array,
     temperature: Array,
@@ -72,7 +54,7 @@ def target_probs(
 
 
 def critic_loss(
-    params: PyTree, critics: Critics, batch: Batch, wanted: Array
+    params: PyTree, critics: Critics, batch: Transitions, wanted: Array
 ) -> tuple[Array, Array]:
     """Cross-entropy with `wanted` [2, B, Z], summed over critics, and the mass at both ends [].
 

@@ -56,12 +56,13 @@ class Transitions(NamedTuple):
     """What updates learn from; leading axis [B].
 
     Attributes:
-      obs: [B, O], raw.
+      obs: [B, O], raw as `sample` draws them, normalised as the losses take them.
       action: [B, A], in [-1, 1].
-      reward: [B], of the steps up to `next_obs` or the end of the task, discounted, unscaled.
+      reward: [B], of the steps up to `next_obs` or the end of the task, discounted; unscaled as
+        they are drawn, scaled as the losses take them.
       discount: [B], how much what follows `next_obs` counts; 0 where the task has ended.
       is_known: [B] bool; those of which nothing is known do not count.
-      next_obs: [B, O], raw.
+      next_obs: [B, O], as `obs`.
     """
 
     obs: Array
@@ -89,20 +90,10 @@ def empty_replay(spec: EnvSpec, num_steps: int, num_envs: int, dtype: DTypeLike)
     )
 
 
-def size_bytes(replay: Replay) -> int:
-    """Of the ring in memory."""
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(replay))
-
-
 def kind_of(terminated: Array, truncated: Array, is_diverged: Array) -> Array:
     """What follows steps [...], int8."""
     kind = jnp.where(terminated, TERMINATED, jnp.where(truncated, CUT, GOES_ON))
     return jnp.where(is_diverged, CUT, kind).astype(jnp.int8)
-
-
-def can_learn(replay: Replay, learning_starts: int) -> Array:
-    """Whether [] there are so many rows to learn from."""
-    return replay.filled >= learning_starts
 
 
 def insert(

@@ -20,9 +20,10 @@ from gmijax.collectives.interface import Collectives
 from gmijax.learning.algorithm import Algorithm, IterationMetrics
 from gmijax.learning.learner import acting_weights, finish_iteration, make_learner, policy_figures
 from gmijax.learning.normalize import moments_of, without_outliers
+from gmijax.learning.saved_arrays import size_bytes
 from gmijax.learning.unroll import RolloutSums, act, count, merge_sums, outcome_of, unroll
 from gmijax.sac.losses import CriticFigures
-from gmijax.sac.replay import Replay, can_learn, insert, kind_of, size_bytes
+from gmijax.sac.replay import Replay, insert, kind_of
 from gmijax.sac.state import Memory, SacLearner, SacState, begin, init, num_averaged
 from gmijax.sac.updates import UpdateFigures, losses_of, update_critics, update_policy
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
@@ -85,7 +86,7 @@ def learn_in_round(
     """The updates after a step: of the policy too, if its turn comes as often."""
     num_updates, every = learner.config.updates_per_step, learner.config.policy_every
     # The same on all GMIs, whose replays fill alike. Before, there is too little to learn from.
-    is_ready = can_learn(replay, learner.config.learning_starts)
+    is_ready = replay.filled >= learner.config.learning_starts
     of_critics = partial(update_critics, learner, collectives, replay)
     if num_updates < every:
         after, figures = jax.lax.scan(of_critics, state, jax.random.split(key, num_updates))

@@ -17,7 +17,6 @@ from gmijax.learning.learner import acting_moments
 from gmijax.learning.normalize import normalize
 from gmijax.sac.critics import critics_of
 from gmijax.sac.losses import (
-    Batch,
     CriticFigures,
     critic_loss,
     policy_loss,
@@ -25,7 +24,7 @@ from gmijax.sac.losses import (
     target_probs,
     temperature_loss,
 )
-from gmijax.sac.replay import Replay, sample, sample_obs
+from gmijax.sac.replay import Replay, Transitions, sample, sample_obs
 from gmijax.sac.state import SacLearner, SacState, optimizers
 from gmijax.types import Array, PRNGKey, PyTree
 
@@ -123,23 +122,20 @@ def update_policy(
     return state._replace(params=params, opt_states=opt_states), loss
 
 
-def _batch(learner: SacLearner, state: SacState, replay: Replay, key: PRNGKey) -> Batch:
-    """Transitions of this GMI's replay, normalised by what is known now."""
+def _batch(learner: SacLearner, state: SacState, replay: Replay, key: PRNGKey) -> Transitions:
+    """Transitions of this GMI's replay as the losses take them, by what is known now."""
     config = learner.config
     moments = acting_moments(config, state)
     drawn = sample(replay, key, config.batch_size, config.n_step, config.discounting)
-    return Batch(
+    return drawn._replace(
         obs=normalize(moments, drawn.obs),
-        action=drawn.action,
         reward=config.reward_scaling * drawn.reward,
-        discount=drawn.discount,
-        is_known=drawn.is_known,
         next_obs=normalize(moments, drawn.next_obs),
     )
 
 
 def _gradients(
-    learner: SacLearner, state: SacState, batch: Batch, key: PRNGKey
+    learner: SacLearner, state: SacState, batch: Transitions, key: PRNGKey
 ) -> tuple[tuple[PyTree, Array], CriticFigures]:
     """Of critics and temperature; and figures."""
     critics, temperature = critics_of(learner.config), jnp.exp(state.log_temperature)

@@ -27,6 +27,7 @@ from gmijax.errors import CollectiveTimeout, ConfigError, ReportedError
 from gmijax.runs.compile_lock import ON_WAIT
 from gmijax.runs.folder import GmiPaths, RunPaths, write_json
 from gmijax.supervise.heartbeat import GmiState, Heartbeat, HeartbeatBlock
+from gmijax.supervise.stop_signals import STOP_SIGNALS
 
 ENV_GMI: Final = "GMIJAX_GMI"
 ENV_CPUS: Final = "GMIJAX_CPUS"
@@ -38,9 +39,6 @@ ENV_HEARTBEAT_FD: Final = "GMIJAX_HEARTBEAT_FD"
 
 STOP_BYTE: Final = b"s"
 END_BYTE: Final = b"e"
-
-LEFT_TO_CONTROLLER: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
-"""Signals that a GMI with a lifeline ignores."""
 
 _WRITERS: Final = (io.TextIOWrapper, io.BufferedWriter, io.BufferedRandom)
 """Files that a role or a task may have left open."""
@@ -230,11 +228,11 @@ def _exit_without_teardown(exit_codes: list[int]) -> None:
 
 def _leave_signals_to_controller() -> None:
     # A handler and not SIG_IGN, which programs that a role starts would inherit.
-    for number in LEFT_TO_CONTROLLER:
+    for number in STOP_SIGNALS:
         signal.signal(number, lambda *_: None)
         signal.siginterrupt(number, False)
     # The controller had them blocked, so that none could end this process until now.
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_CONTROLLER)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
     if sys.__stderr__ is not None:
         faulthandler.enable(sys.__stderr__)
         faulthandler.register(STACKS_SIGNAL, sys.__stderr__, all_threads=True)

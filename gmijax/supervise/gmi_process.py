@@ -16,11 +16,11 @@ from gmijax.supervise.child import (
     ENV_HEARTBEAT_FD,
     ENV_LIFELINE_FD,
     ENV_RUN_DIR,
-    LEFT_TO_CONTROLLER,
     STACKS_SIGNAL,
     STOP_BYTE,
 )
 from gmijax.supervise.heartbeat import HeartbeatBlock
+from gmijax.supervise.stop_signals import STOP_SIGNALS
 from gmijax.supervise.watched_gmi import WatchedGmi
 
 _GROUP_ENDS_S = 2.0
@@ -140,7 +140,7 @@ def _spawn(
     command: Sequence[str], environment: Mapping[str, str], paths: GmiPaths, fds: tuple[int, ...]
 ) -> subprocess.Popen[bytes]:
     # The child inherits that they are blocked, until it can leave them to this process.
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_CONTROLLER)
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
         # Files, not pipes: a child that floods a pipe which nobody reads would block.
         with paths.stdout.open("wb") as stdout, paths.stderr.open("wb") as stderr:

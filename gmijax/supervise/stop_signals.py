@@ -11,7 +11,9 @@ from types import FrameType
 from typing import Final
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
-"""What asks a job to save and end: Ctrl-C, batch systems, a terminal that is closed."""
+"""What asks a job to save and end: Ctrl-C, batch systems, a terminal that is closed.
+
+The controller hears them; a GMI with a lifeline ignores them."""
 
 _AGAIN_S: Final = 1.0
 

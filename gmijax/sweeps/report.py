@@ -240,11 +240,9 @@ def draw_curves(jobs: Sequence[AnyJob], ranking: Ranking, paths: SweepPaths) -> 
     if not drawn:
         return
     # Imported here: it costs half a second that no other use of this module should pay.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 5), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for label, own in drawn.items():
         steps, middle = spread([job.progress.curve for job in own])

@@ -116,7 +116,8 @@ class Scheduler(Generic[J]):
                 continue
             if not self._sites_to_avoid(job):
                 return  # In order, so that a large job is not passed by forever.
-        while not self._queue and self._slots.has_free_slot() and (job := self._study.next()):
+        has_room = self._slots.num_gpus_with_free_slot
+        while not self._queue and has_room() and (job := self._study.next()):
             self._jobs.append(job)
             if not self._start_if_it_fits(job):
                 self._queue.append(job)

@@ -125,10 +125,6 @@ class SlotPool:
         self._limits: dict[tuple[int, int], int] = {}
         self.left = set(range(len(sites)))
 
-    def has_free_slot(self, avoid: Collection[int] = ()) -> bool:
-        """Whether any slot is free on machines other than those of `avoid`."""
-        return self.num_gpus_with_free_slot(avoid) > 0
-
     def num_gpus_with_free_slot(self, avoid: Collection[int] = ()) -> int:
         """GPUs that have a free slot, on machines other than those of `avoid`."""
         return sum(len(self._open_slots(site)) for site in self.left.difference(avoid))
@@ -229,8 +225,7 @@ def _by_gpu(allocations: Iterable[Allocation]) -> dict[int, list[Allocation]]:
 
 def _labels(site: Site) -> dict[int, str]:
     """Label of every slot, by GMI id."""
-    index_of = {gpu.uuid: gpu.index for gpu in site.machine.gpus}
-    index_of |= {one.uuid: gpu.index for gpu in site.machine.gpus for one in gpu.instances}
+    index_of = site.machine.index_of_device
     node = f"{site.name} " if site.name else ""
     labels: dict[int, str] = {}
     for here in _by_gpu(site.plan.allocations).values():

@@ -9,6 +9,7 @@ from rich.console import Console
 
 from gmijax.config.sweep import Ranking
 from gmijax.control.console import nearby, print_reasons
+from gmijax.runs.names import counted
 from gmijax.sweeps.any_job import J
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.report import tables
@@ -35,7 +36,7 @@ def announce(
     more = f", {num_complete} of them complete already" if num_complete else ""
     slots = sum(len(site.plan.allocations) for site in sites)
     at_once = f"at most {slots}" if work.is_adaptive and sites[0].machine.gpus else str(slots)
-    console.print(f"{_counted(total, 'job')}{more}, {at_once} at a time {_where(sites)}")
+    console.print(f"{counted(total, 'job')}{more}, {at_once} at a time {_where(sites)}")
     print_reasons(console, [reason for site in sites for reason in site.plan.reasons])
     if work.words and total == 1 and not work.space and settings.sampler == "grid":
         console.print("  one job, because no key has several values; KEY=A,B makes a job of each")
@@ -66,13 +67,9 @@ def print_outcome(
 def _where(sites: Sequence[Site]) -> str:
     """Where jobs run, in words."""
     names = [site.name for site in sites if site.name]
-    nodes = f" of {_counted(len(names), 'node')} ({', '.join(names)})" if names else ""
+    nodes = f" of {counted(len(names), 'node')} ({', '.join(names)})" if names else ""
     backend = sites[0].plan.backend
     if backend == "cpu":
         return f"on the CPU{nodes}"
     num_gpus = sum(site.plan.layout.num_gpus for site in sites)
-    return f"on {_counted(num_gpus, 'GPU')}{nodes}, backend {backend}"
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count:,} {what}{'' if count == 1 else 's'}"
+    return f"on {counted(num_gpus, 'GPU')}{nodes}, backend {backend}"

@@ -33,7 +33,7 @@ def main(order: Path, lifeline_fd: int) -> int:
     configs = [from_dict(TrainConfig, config) for config in data["configs"]]
     if len(configs) == 1:
         return exit_code_of("train", lambda: train(configs[0], show=True))
-    return exit_code_of("train", lambda: train_packed(configs, order.with_suffix(""), show=True))
+    return exit_code_of("train", lambda: train_packed(configs, order.with_suffix("")))
 
 
 def _end_with_the_sweep(fd: int) -> None:

@@ -22,6 +22,7 @@ from gmijax.cluster import ray_nodes
 from gmijax.cluster.checks import by_name, require_alike, require_shared
 from gmijax.cluster.cluster_job import BackendOfNodes, ClusterJob
 from gmijax.cluster.node import (
+    COMPARED,
     Facts,
     Node,
     NodeEndpoints,
@@ -29,7 +30,6 @@ from gmijax.cluster.node import (
     TrainingNode,
     address_of,
     interface_of,
-    own_versions,
 )
 from gmijax.cluster.ray_nodes import NodeHandle, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
@@ -50,6 +50,7 @@ from gmijax.runs.folder import GmiPaths, RunPaths
 from gmijax.supervise.failures import describe_exit, first_cause, is_consequence
 from gmijax.supervise.heartbeat import Heartbeat
 from gmijax.supervise.job_kinds import JobKind
+from gmijax.version import versions_of
 
 
 class FakeAnswer:
@@ -75,7 +76,7 @@ def a_node(**answers: Any) -> RemoteNode:
 
 
 def joined(node: RemoteNode, versions: dict[str, str | None] | None = None) -> list[NodeHandle]:
-    return [NodeHandle(node, Facts(node.address, machine(0), versions or own_versions()))]
+    return [NodeHandle(node, Facts(node.address, machine(0), versions or versions_of(COMPARED)))]
 
 
 @pytest.mark.parametrize(
@@ -132,30 +133,27 @@ def test_without_ray_or_a_cluster_the_line_says_what_to_do(
         RayCluster(ClusterConfig(), Node)
 
 
+NO_ADDRESSES = (
+    *("somewhere", "9" * 30, "head:" + "9" * 5000, "head:65536", "head:0", ":6379"),
+    *("head:\N{SUPERSCRIPT TWO}", "head:\N{ARABIC-INDIC DIGIT SIX}379", "head:6379\n"),
+)
+NO_HOSTS = ("a" * 100, "head\0", "..", "\udc80")
+
+
 @pytest.mark.parametrize(
-    "address",
+    ("address", "message"),
     [
-        *("somewhere", "9" * 30, "head:" + "9" * 5000, "head:65536", "head:0", ":6379"),
-        *("head:\N{SUPERSCRIPT TWO}", "head:\N{ARABIC-INDIC DIGIT SIX}379", "head:6379\n"),
+        *((one, "expected auto, local or host:port with a port from 1") for one in NO_ADDRESSES),
+        *((f"{host}:6379", "nothing answers there") for host in NO_HOSTS),
     ],
 )
 def test_an_address_that_cannot_be_is_refused(
-    address: str, monkeypatch: pytest.MonkeyPatch
+    address: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ray = SimpleNamespace(is_initialized=lambda: False)
     monkeypatch.setattr(ray_nodes, "import_ray", lambda: ray)
-    with pytest.raises(ConfigError, match=r"expected auto, local or host:port with a port from 1"):
+    with pytest.raises(ConfigError, match=message):
         RayCluster(ClusterConfig(address=address), Node)
-
-
-@pytest.mark.parametrize("host", ["a" * 100, "head\0", "..", "\udc80"])
-def test_a_name_of_a_host_that_cannot_be_is_one_nobody_answers_at(
-    host: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ray = SimpleNamespace(is_initialized=lambda: False)
-    monkeypatch.setattr(ray_nodes, "import_ray", lambda: ray)
-    with pytest.raises(ConfigError, match="nothing answers there"):
-        RayCluster(ClusterConfig(address=f"{host}:6379"), Node)
 
 
 def test_a_cluster_for_one_job_has_a_token_of_its_own_and_is_for_this_machine_alone(
@@ -236,7 +234,7 @@ def test_several_nodes_of_a_machine_have_names_of_their_own() -> None:
 
 
 def test_nodes_with_other_versions_are_refused() -> None:
-    nodes = joined(a_node(), {**own_versions(), "jax": "0.1"})
+    nodes = joined(a_node(), {**versions_of(COMPARED), "jax": "0.1"})
     with pytest.raises(ConfigError, match=r"in jax: .* on this machine; 0\.1 on 10\.0\.0\.2;"):
         require_alike(nodes)
 
@@ -247,12 +245,12 @@ def test_a_node_with_another_gmijax_says_so_before_all_else(
     monkeypatch.chdir(tmp_path)
     node = Node({}, str(tmp_path), None, "10.0.0.2")
     assert "differ in gmijax: 9.9 on this machine; " in str(node.facts("9.9"))
-    assert isinstance(node.facts(str(own_versions()["gmijax"])), Facts)
+    assert isinstance(node.facts(str(versions_of(COMPARED)["gmijax"])), Facts)
 
 
 @pytest.mark.parametrize("package", ["cuda-bindings", "nccl4py"])
 def test_packages_for_gpus_are_compared_between_nodes_that_have_some(package: str) -> None:
-    versions = {**own_versions(), "jax-cuda13-plugin": "0.9"}
+    versions = {**versions_of(COMPARED), "jax-cuda13-plugin": "0.9"}
     facts = [
         Facts(name, machine(1), versions | {package: number})
         for name, number in (("a", "13.0"), ("b", None))
@@ -266,7 +264,7 @@ def test_packages_for_gpus_are_compared_between_nodes_that_have_some(package: st
 
 
 def test_the_doctor_says_in_what_nodes_differ() -> None:
-    own = own_versions()
+    own = versions_of(COMPARED)
     nodes = {
         "a": NodeInfo(Facts("a", machine(2), own), 0.01),
         "b": NodeInfo(Facts("b", machine(1), {**own, "jax": "0.1", "cuda-bindings": "13"}), -90.0),

@@ -23,22 +23,20 @@ def failing(number: int) -> Callable[..., None]:
     return write
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO])
+@pytest.mark.parametrize(
+    ("number", "exit_code"),
+    [
+        *((number, 1) for number in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)),
+        # A folder in place of a file is bad input.
+        *((number, 2) for number in (errno.EISDIR, errno.ENOTDIR, errno.EEXIST)),
+    ],
+)
 @pytest.mark.parametrize("verb", ["train", "search", "serve", "play", "export", "sweep"])
 def test_an_error_of_the_disk_is_one_line(
-    verb: str, number: int, capsys: pytest.CaptureFixture[str]
+    verb: str, number: int, exit_code: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert exit_code_of(verb, failing(number)) == 1
+    assert exit_code_of(verb, failing(number)) == exit_code
     said = f"gmijax.{verb}: runs/x/search.json: {os.strerror(number)}\n"
-    assert capsys.readouterr().err == said
-
-
-@pytest.mark.parametrize("number", [errno.EISDIR, errno.ENOTDIR, errno.EEXIST])
-def test_a_folder_in_place_of_a_file_is_bad_input(
-    number: int, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert exit_code_of("train", failing(number)) == 2
-    said = f"gmijax.train: runs/x/search.json: {os.strerror(number)}\n"
     assert capsys.readouterr().err == said
 
 

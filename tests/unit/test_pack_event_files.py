@@ -96,7 +96,7 @@ def test_what_is_no_event_file_is_nothing(tmp_path: Path) -> None:
 def test_a_program_that_prints_nothing_has_a_rate(tmp_path: Path, writer: EventsWriter) -> None:
     clock = Clock()
     events = EventReader(tmp_path, TAG, 0.0, clock)
-    reader = ProgressReader(OutputReader(tmp_path / "log"), None, 0.0, clock, events)
+    reader = ProgressReader(OutputReader(tmp_path / "log"), None, 0.0, events, clock)
     for step in (100, 200, 300):
         clock.now_s += 10.0
         add(writer, step, step / 100)
@@ -110,7 +110,7 @@ def test_steps_that_are_printed_win_over_those_of_the_files(
     clock, log = Clock(), tmp_path / "log"
     events = EventReader(tmp_path, TAG, 0.0, clock)
     own = own_patterns(None, r"at (\d+)", None)
-    reader = ProgressReader(OutputReader(log), own, 0.0, clock, events)
+    reader = ProgressReader(OutputReader(log), own, 0.0, events, clock)
     clock.now_s += 10.0
     log.write_text("at 5000, reward=7\n")
     add(writer, 1, 2.0)

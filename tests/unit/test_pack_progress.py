@@ -59,7 +59,7 @@ def append(log: Path, *lines: str) -> None:
 
 
 def reader_of(log: Path, clock: Clock, own: Family | None = None) -> ProgressReader:
-    return ProgressReader(OutputReader(log), own, 0.0, clock)
+    return ProgressReader(OutputReader(log), own, 0.0, clock=clock)
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)

@@ -135,24 +135,21 @@ def test_the_last_run_is_not_mistaken_for_one_that_is_training(
     assert open_run(config_of())[2] is None
 
 
-def test_envs_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytest.MonkeyPatch):
-    env = EnvConfig(name="ant", episode_length=None)
-    monkeypatch.setattr(trained_run, "trained_config", lambda checkpoint: (env, None))
-    monkeypatch.setattr(trained_run, "left_out", lambda checkpoint: None)
-    config = config_of(f"run.dir={run.root}", "randomize=on")
-    with pytest.raises(ConfigError, match="names nothing to draw"):
-        playing.play(config)
-
-
-def test_a_walking_test_is_refused_where_there_is_none(
-    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("randomize=on", "names nothing to draw"),
+        ("walking_envs=8", "walking_envs=8: ant has no walking test"),
+    ],
+)
+def test_what_the_task_does_not_have_is_refused(
+    override: str, message: str, run: RunPaths, monkeypatch: pytest.MonkeyPatch
 ):
     env = EnvConfig(name="ant", episode_length=None)
     monkeypatch.setattr(trained_run, "trained_config", lambda checkpoint: (env, None))
     monkeypatch.setattr(trained_run, "left_out", lambda checkpoint: None)
-    config = config_of(f"run.dir={run.root}", "walking_envs=8")
-    with pytest.raises(ConfigError, match="walking_envs=8: ant has no walking test"):
-        playing.play(config)
+    with pytest.raises(ConfigError, match=message):
+        playing.play(config_of(f"run.dir={run.root}", override))
 
 
 def test_a_robot_that_repeats_actions_has_no_walking_test(

@@ -5,16 +5,11 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.paper_model import (
-    Sizes,
     Task,
-    dominant_resource,
     penalty,
     serving_gain,
-    tcg_ex_bytes,
     tcg_ex_resource,
     tcg_resource,
-    tdg_bytes,
-    tdg_ex_bytes,
     tdg_ex_resource,
     tdg_resource,
     throughput,
@@ -25,7 +20,6 @@ from gmijax.errors import ConfigError
 # Section 5.1: R_s = 10 R_a = 5 R_t, T_s = 6 T_a = 3 T_t, alpha 0.2, beta 0.3.
 SIMULATOR, AGENT, TRAINER = Task(6.0, 10.0), Task(1.0, 1.0), Task(2.0, 2.0)
 ALPHA, BETA = 0.2, 0.3
-SIZES = Sizes(state=100.0, action=10.0, reward=1.0, parameters=1000.0)
 
 
 def test_serving_penalty_of_colocation_is_016():
@@ -60,19 +54,6 @@ def test_training_gains_about_five():
 def test_without_communication_separation_wins_by_the_penalty():
     gain = serving_gain(SIMULATOR, AGENT, ALPHA, com_s=0.0)
     assert gain == pytest.approx(0.86)
-
-
-def test_bytes_of_the_tables():
-    assert tdg_bytes(SIZES) == 211  # 2 * 100 + 10 + 1
-    assert tcg_ex_bytes(SIZES, num_gmis=4) == 1500  # 2 * 3 / 4 * 1000
-    assert tcg_ex_bytes(SIZES, num_gmis=1) == 0
-    assert tdg_ex_bytes(SIZES, steps=32, num_gmis=4) == 32 * 111 + 1000 + 1500
-
-
-def test_dominant_resource_is_the_one_used_more_and_sm_on_a_tie():
-    assert dominant_resource(66, 132, 20, 140) == "sm"
-    assert dominant_resource(33, 132, 70, 140) == "memory"
-    assert dominant_resource(66, 132, 70, 140) == "sm"
 
 
 def test_throughput_counts_instances_and_time():

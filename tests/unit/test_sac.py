@@ -33,12 +33,13 @@ from gmijax.machine.xla_on_cpu import POOL
 from gmijax.runs.folder import RunPaths
 from gmijax.sac import sac
 from gmijax.sac.critics import critics_of, projected
-from gmijax.sac.losses import Batch, critic_loss, target_probs, temperature_loss
+from gmijax.sac.losses import critic_loss, target_probs, temperature_loss
 from gmijax.sac.replay import (
     CUT,
     GOES_ON,
     TERMINATED,
     Replay,
+    Transitions,
     empty_replay,
     insert,
     kind_of,
@@ -238,10 +239,11 @@ def learner_of(*overrides: str) -> Any:
     return SAC.make_learner(ENV.spec, config)
 
 
-def batch_of(discount: float, *, is_known: bool = True) -> Batch:
+def batch_of(discount: float, *, is_known: bool = True) -> Transitions:
     ones = jnp.ones((2, 1))
     known = jnp.full(2, is_known)
-    return Batch(jnp.ones((2, 2)), ones, 3.0 * ones[:, 0], jnp.full(2, discount), known, ones)
+    obs, reward = jnp.ones((2, 2)), 3.0 * ones[:, 0]
+    return Transitions(obs, ones, reward, jnp.full(2, discount), known, ones)
 
 
 def test_targets_add_what_follows_unless_the_task_has_ended() -> None:

@@ -164,7 +164,7 @@ def test_slots_of_a_node_that_is_gone_are_neither_acquired_nor_released() -> Non
     slots.remove_site(slot.site)
     slots.release(slot)
     assert [taken.site for _ in range(3) if (taken := slots.acquire(1))] == [1, 1]
-    assert not slots.has_free_slot()
+    assert not slots.num_gpus_with_free_slot()
     slots.remove_site(1)
     assert not slots.left
 

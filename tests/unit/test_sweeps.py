@@ -315,7 +315,7 @@ def test_jobs_of_one_program_have_the_memory_and_cores_of_their_slots() -> None:
     assert len(three.cpus) == 3 * len(taken(slots).cpus)
     rest = [slots.acquire(1, num_jobs=8) for _ in range(2)]
     assert [slot.size for slot in rest if slot is not None] == [3, 1]
-    assert not slots.has_free_slot()
+    assert not slots.num_gpus_with_free_slot()
     slots.release(three)
     again = slots.acquire(1, num_jobs=8)
     assert again is not None

@@ -15,7 +15,7 @@ atexit.register(threading.Event().wait)
 def wait(done):
     assert not done.wait(0.2)
     raise TimeoutError("nobody came")
-WatchedThread("test").run(threading.Event().wait, wait)
+WatchedThread().run(threading.Event().wait, wait)
 """
     done = subprocess.run(
         [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=120

@@ -23,7 +23,7 @@ class LockstepRunner:
     def __init__(self, group: Group, num_floats: int) -> None:
         self._group, self._barrier = group, group.local.barrier
         self._num_floats = num_floats
-        self._thread = WatchedThread("step")
+        self._thread = WatchedThread()
         self._is_running = False
 
     @property

@@ -30,10 +30,10 @@ class WatchedThread:
       is_stuck: whether a call has been given up.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self) -> None:
         self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
         self.is_stuck = False
-        threading.Thread(target=self._serve, name=name, daemon=True).start()
+        threading.Thread(target=self._serve, name="step", daemon=True).start()
 
     def run(self, function: Callable[[], T], wait: Callable[[threading.Event], object]) -> T:
         """Returns what `function` returns, or raises what it raises.

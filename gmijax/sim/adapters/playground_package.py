@@ -20,13 +20,13 @@ from typing import Any
 from gmijax.sim.adapters.checks import attempt
 from gmijax.sim.robot_models import model_folder
 
-_FOR_TORCH = "mujoco_playground._src.wrapper_torch"
+_TORCH_WRAPPER = "mujoco_playground._src.wrapper_torch"
 
 
 def import_playground() -> Any:
     """The package `mujoco_playground`, which finds models as `robot_models` does."""
     # By name: it is not installed where gmijax is checked.
-    with _imported_when_used(_FOR_TORCH):
+    with _torch_when_used():
         package = attempt("env=playground", importlib.import_module, "mujoco_playground")
     base: Any = importlib.import_module("mujoco_playground._src.mjx_env")
     base.MENAGERIE_PATH = _Models()
@@ -45,12 +45,12 @@ class _Models:
 
 
 @contextmanager
-def _imported_when_used(name: str) -> Iterator[None]:
-    """Within it, to import the module `name` defers running it until its first use.
+def _torch_when_used() -> Iterator[None]:
+    """Within it, to import Playground's wrapper for PyTorch defers running it until its first use.
 
-    Playground's wrapper for PyTorch imports PyTorch, which takes seconds in every GMI.
+    It imports PyTorch, which takes seconds in every GMI.
     """
-    finder = _Later(name)
+    finder = _Later()
     sys.meta_path.insert(0, finder)
     try:
         yield
@@ -59,16 +59,13 @@ def _imported_when_used(name: str) -> Iterator[None]:
 
 
 class _Later(MetaPathFinder):
-    """Finds one module, and defers running it until its first use."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
+    """Finds the wrapper, and defers running it until its first use."""
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         """See `MetaPathFinder`."""
-        spec = PathFinder.find_spec(name, path, target) if name == self._name else None
+        spec = PathFinder.find_spec(name, path, target) if name == _TORCH_WRAPPER else None
         if spec is not None and spec.loader is not None:
             spec.loader = LazyLoader(spec.loader)
         return spec
