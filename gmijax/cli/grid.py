@@ -31,6 +31,14 @@ class SweepHelp(TrainConfig):
     sweep: SweepConfig
 
 
+@dataclass(frozen=True, kw_only=True)
+class _SweepKeys:
+    """Keys of the sweep itself: those of its jobs are a `TrainConfig` each."""
+
+    sweep: SweepConfig
+    cluster: ClusterConfig = ClusterConfig()
+
+
 def build_sweep(overrides: Sequence[str]) -> SweepWork:
     """The sweep of a command line, with all that can be checked of it.
 
@@ -56,9 +64,9 @@ def build_sweep(overrides: Sequence[str]) -> SweepWork:
     fixed = [
         text for text, item in given if text not in own + nodes and not item.is_sweep_override()
     ]
-    settings = from_dict(SweepConfig, compose_dict("sweep", own)["sweep"], "sweep.")
     # Nodes are the sweep's; each job is a training on one machine.
-    cluster = from_dict(ClusterConfig, compose_dict("train", nodes)["cluster"], "cluster.")
+    parts = {"sweep": compose_dict("sweep", own), "cluster": compose_dict("train", nodes)}
+    keys = from_dict(_SweepKeys, {key: data[key] for key, data in parts.items() if key in data})
     space = {item.key_or_group: values_of(item) for _, item in given if item.is_sweep_override()}
 
     config_of = _Composer(fixed, [key for key in space if choices(key)])
@@ -66,9 +74,9 @@ def build_sweep(overrides: Sequence[str]) -> SweepWork:
     def make_job(number: int, chosen: Mapping[str, str]) -> Job:
         return Job(number, chosen, config_of(chosen))
 
-    points = grid(space) if settings.sampler == "grid" else corners(space)
+    points = grid(space) if keys.sweep.sampler == "grid" else corners(space)
     jobs = [make_job(number, chosen) for number, chosen in enumerate(points)]
-    return replace(sweep_of(settings, space, make_job, jobs, cluster), words=words)
+    return replace(sweep_of(keys.sweep, space, make_job, jobs, keys.cluster), words=words)
 
 
 def without_folder(words: Sequence[str]) -> tuple[str, ...]:
