@@ -6,7 +6,7 @@ import copy
 import fnmatch
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override, RangeSweep
@@ -36,7 +36,7 @@ class _SweepKeys:
     """Keys of the sweep itself: those of its jobs are a `TrainConfig` each."""
 
     sweep: SweepConfig
-    cluster: ClusterConfig = ClusterConfig()
+    cluster: ClusterConfig = field(default_factory=ClusterConfig)
 
 
 def build_sweep(overrides: Sequence[str]) -> SweepWork:
