@@ -12,9 +12,14 @@ from gmijax.config import BackendName, TrainConfig
 from gmijax.config.schema import flatten, to_dict
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.names import nearby
+from gmijax.runs.saved_config import config_of_run, differences, task_and_algorithm
 from gmijax.sweeps.any_job import label_of
 from gmijax.sweeps.progress import Progress, State
 from gmijax.sweeps.slots import Slot
+
+_LEARNT_WITH = ("env.", "algo.", "physics.", "num_envs ", "seed ")
+"""Beginnings of the keys that decide what a job learns."""
 
 
 @dataclass(frozen=True)
@@ -125,10 +130,30 @@ def started_in(config: TrainConfig, run: RunPaths) -> TrainConfig:
 
 
 def state_of(run: RunPaths, config: TrainConfig) -> State:
-    """Whether an earlier attempt at the sweep has completed a job."""
+    """Whether an earlier attempt at the sweep has completed a job.
+
+    Raises:
+      ConfigError: it has, with other settings: jobs of these would be compared with it.
+    """
     if not run.summary.exists():
         return "waiting"
     summary = read_json(run.summary)
     steps = summary.get("env_steps")
     is_far = isinstance(steps, int | float) and steps >= config.num_timesteps
-    return "completed" if summary.get("status") == "completed" and is_far else "waiting"
+    if summary.get("status") != "completed" or not is_far:
+        return "waiting"
+    _require_same(run, config)
+    return "completed"
+
+
+def _require_same(run: RunPaths, config: TrainConfig) -> None:
+    saved = config_of_run(run)
+    env, algo = task_and_algorithm(saved)
+    # Keys that its version did not have are as they were without.
+    whole = saved | {"env": to_dict(env), "algo": to_dict(algo)}
+    changes = differences(whole, to_dict(config))
+    if changed := [text for text in changes if text.startswith(_LEARNT_WITH)]:
+        raise ConfigError(
+            f"{nearby(run.root)}: this job is complete with other settings: {changed[0]}; give "
+            "those, or another folder"
+        )

@@ -88,7 +88,7 @@ def _run(
 ) -> SweepResult:
     """Runs the jobs in a folder that is locked, on machines where nothing is started yet."""
     with errors_of_files(paths):
-        jobs, study = _beginning(work, paths)
+        jobs, study = _beginning(work, paths, console)
         report = JobsReport(jobs, work.ranking, work.described, paths, folder, started_s)
         report.begin()
     console.print(f"{work.name} folder: {nearby(paths.root)}")
@@ -227,7 +227,7 @@ def _lease(
             time.sleep(_LEASE_POLL_S)
 
 
-def _beginning(work: Work[J], paths: SweepPaths) -> tuple[list[J], Study[J]]:
+def _beginning(work: Work[J], paths: SweepPaths, console: Console) -> tuple[list[J], Study[J]]:
     """The jobs that are known, as far as an earlier command has come, and where more come from.
 
     Raises:
@@ -242,7 +242,7 @@ def _beginning(work: Work[J], paths: SweepPaths) -> tuple[list[J], Study[J]]:
     study = Study[J]()
     jobs = list(work.jobs)
     if settings.sampler != "grid":
-        study = OptunaStudy(settings, work.space, work.make_job, paths.study)
+        study = OptunaStudy(settings, work.space, work.make_job, paths.study, console.print)
         jobs = study.earlier()
     for job in jobs:
         run = paths.job(job.number)

@@ -57,11 +57,12 @@ def grid(space: Space, command: str = "sweep") -> list[dict[str, str]]:
 
 
 def corners(space: Space) -> list[dict[str, str]]:
-    """Points that have every value of every list and both ends of every interval."""
+    """Points that have every value of every list, and of every interval its ends and one between.
+
+    What lies between is no whole number, where fractions may be drawn.
+    """
     columns = {
-        key: values.values
-        if isinstance(values, Choices)
-        else (as_text(values.low, values), as_text(values.high, values))
+        key: values.values if isinstance(values, Choices) else _some_of(values)
         for key, values in space.items()
     }
     most = max(map(len, columns.values()), default=1)
@@ -69,6 +70,12 @@ def corners(space: Space) -> list[dict[str, str]]:
         {key: values[min(k, len(values) - 1)] for key, values in columns.items()}
         for k in range(most)
     ]
+
+
+def _some_of(interval: Interval) -> tuple[str, ...]:
+    low, high = interval.low, interval.high
+    between = low + (high - low) / math.pi
+    return tuple(as_text(value, interval) for value in (low, high, between))
 
 
 def as_text(value: float, interval: Interval) -> str:

@@ -20,6 +20,9 @@ _REPORTS = 100
 _FULL = "window_full"
 """Attribute of a trial: whether its value can be compared."""
 
+_NOT_ALLOWED = "not_allowed"
+"""Attribute of a trial: why there is no job with its values."""
+
 _MOST_RANDOM = 10
 """Trials before TPE begins, with many of them: Optuna's default. With few, a quarter of them."""
 
@@ -51,12 +54,19 @@ class OptunaStudy(Study[J]):
       space: what trials choose from.
       make_job: a job with such values.
       journal: the file.
+      say: gets a line for every trial whose values are not allowed together.
     """
 
     def __init__(
-        self, settings: JobsConfig, space: Space, make_job: MakeJob[J], journal: Path
+        self,
+        settings: JobsConfig,
+        space: Space,
+        make_job: MakeJob[J],
+        journal: Path,
+        say: Callable[[str], object],
     ) -> None:
         self._settings, self._space, self._make_job = settings, space, make_job
+        self._say = say
         self._optuna = optuna = optuna_package()
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         _cut_half_a_line(journal)
@@ -85,23 +95,36 @@ class OptunaStudy(Study[J]):
         jobs = []
         for trial in self._study.trials:
             if trial.state.is_finished() and trial.params.keys() >= self._space.keys():
+                if _NOT_ALLOWED in trial.user_attrs:
+                    continue
                 jobs.append(self._make_job(trial.number, self._chosen(trial.params)))
                 if trial.state == self._states.PRUNED:
                     jobs[-1].progress.state = "pruned"
         return jobs
 
     def next(self) -> J | None:
-        """See `Study`."""
+        """See `Study`. A trial whose values are not allowed together counts as one."""
+        while (trial := self._next_trial()) is not None:
+            try:
+                job = self._make_job(trial.number, self._chosen(trial.params))
+            except ConfigError as error:
+                self._say(f"trial {trial.number} is left out: {error}")
+                trial.set_user_attr(_NOT_ALLOWED, str(error))
+                self._study.tell(trial, state=self._states.FAIL)
+                continue
+            self._trials[trial.number] = trial
+            return job
+        return None
+
+    def _next_trial(self) -> Any:
+        """One that waits, else another one; None: there are as many as wanted."""
         if self._left:
             found = self._left.pop(0)
             self._storage.set_trial_state_values(found._trial_id, self._states.RUNNING)
-            trial = self._optuna.trial.Trial(self._study, found._trial_id)
-        elif self._settings.trials is None or self._num_begun() >= self._settings.trials:
+            return self._optuna.trial.Trial(self._study, found._trial_id)
+        if self._settings.trials is None or self._num_begun() >= self._settings.trials:
             return None
-        else:
-            trial = self._study.ask(self._distributions)
-        self._trials[trial.number] = trial
-        return self._make_job(trial.number, self._chosen(trial.params))
+        return self._study.ask(self._distributions)
 
     def is_hopeless(self, job: J) -> bool:
         """See `Study`."""

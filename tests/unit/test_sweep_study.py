@@ -18,11 +18,13 @@ from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.progress import State
 from gmijax.sweeps.study import OptunaStudy
 
+SAID: list[str] = []
+
 
 def study(folder: Path, *overrides: str) -> OptunaStudy:
     request = build_sweep(overrides)
     journal = folder / "study.log"
-    return OptunaStudy(request.settings, request.space, request.make_job, journal)
+    return OptunaStudy(request.settings, request.space, request.make_job, journal, SAID.append)
 
 
 TOY = ("sweep.sampler=tpe", "algo.learning_rate=tag(log,interval(1e-5,1e-2))", "sweep.trials=8")
@@ -49,6 +51,25 @@ def test_eight_trials_of_tpe_find_better_than_the_default(tmp_path: Path) -> Non
         trials.tell(end(job, "completed", values[-1]))
     assert len(values) == 8
     assert max(values) > toy_objective(jobs_of([compose("algo.entropy_cost=1e-2")])[0])
+
+
+def test_values_that_are_not_allowed_together_are_left_out_and_the_others_go_on(
+    tmp_path: Path,
+) -> None:
+    lists = ("num_envs=8,64", "algo.num_minibatches=128,1024")
+    drawn = (*lists, "sweep.sampler=random", "sweep.trials=12")
+    trials = study(tmp_path, *drawn)
+    SAID.clear()
+    jobs = []
+    while job := trials.next():
+        jobs.append(job.number)
+        trials.tell(end(job, "completed", 1.0))
+    assert 0 < len(jobs) < 12
+    assert len(SAID) == 12 - len(jobs)
+    assert all("do not divide into algo.num_minibatches=1024" in line for line in SAID)
+    again = study(tmp_path, *drawn)
+    assert [job.number for job in again.earlier()] == jobs
+    assert again.next() is None
 
 
 def test_a_study_goes_on_with_what_was_running_and_what_failed(tmp_path: Path) -> None:

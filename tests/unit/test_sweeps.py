@@ -20,6 +20,7 @@ from gmijax.autotune.grid import Measured, NotRunnable
 from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
 from gmijax.cli.pack import build_pack
+from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import open_console
 from gmijax.errors import ConfigError, JobInterrupted
@@ -103,6 +104,10 @@ def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
         (("cluster=null", "seed=0,1"), "cluster=None: expected a group of keys"),
         (("++cluster=3", "seed=0,1"), "cluster=3: expected a group of keys"),
         (("~sweep", "seed=0,1"), "missing key sweep"),
+        (
+            ("sweep.sampler=random", "sweep.trials=3", "seed=interval(0,5)"),
+            "expected an integer",
+        ),
         (
             ("sweep.pack=vmap", "sweep.sampler=tpe", "sweep.trials=3", "seed=0,1"),
             "only with sweep.sampler=grid",
@@ -434,10 +439,36 @@ def test_lines_of_older_versions_do_not_say_that_they_can_be_compared() -> None:
 def test_only_a_run_with_all_its_steps_is_complete(tmp_path: Path) -> None:
     run, config = SweepPaths(tmp_path).job(0), compose("num_timesteps=100")
     assert state_of(run, config) == "waiting"
+    write_json(run.config, to_dict(config))
     for status, state in (("interrupted", "waiting"), ("completed", "completed")):
         write_json(run.summary, {"status": status, "env_steps": 100})
         assert state_of(run, config) == state
     assert state_of(run, dataclasses.replace(config, num_timesteps=200)) == "waiting"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "change"),
+    [
+        (("env=ant",), "env.name is 'ant', was 'ball_balance'"),
+        (("num_envs=64",), "num_envs is 64, was 512"),
+        (("algo.learning_rate=1e-3",), "algo.learning_rate is 0.001"),
+        (("env.episode_length=7",), "env.episode_length is 7"),
+        (("seed=3",), "seed is 3, was 0"),
+    ],
+)
+def test_a_complete_job_with_other_settings_is_not_compared(
+    overrides: tuple[str, ...], change: str, tmp_path: Path
+) -> None:
+    run = SweepPaths(tmp_path).job(0)
+    write_json(run.config, to_dict(compose("num_timesteps=100")))
+    write_json(run.summary, {"status": "interrupted", "env_steps": 50})
+    wanted = compose("num_timesteps=100", *overrides)
+    assert state_of(run, wanted) == "waiting"
+    write_json(run.summary, {"status": "completed", "env_steps": 100})
+    with pytest.raises(ConfigError, match=re.escape(f"complete with other settings: {change}")):
+        state_of(run, wanted)
+    own = compose("num_timesteps=100", "run.checkpoint_every=7", "plan.memory_fraction=0.3")
+    assert state_of(run, own) == "completed"
 
 
 def shown_tables(folder: Path, jobs: Sequence[Job], sweep: SweepConfig) -> list[list[list[str]]]:
