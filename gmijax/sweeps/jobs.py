@@ -142,7 +142,8 @@ def state_of(run: RunPaths, config: TrainConfig) -> State:
     is_far = isinstance(steps, int | float) and steps >= config.num_timesteps
     if summary.get("status") != "completed" or not is_far:
         return "waiting"
-    _require_same(run, config)
+    if run.config.exists():
+        _require_same(run, config)
     return "completed"
 
 
