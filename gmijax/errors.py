@@ -47,6 +47,11 @@ def lines_of(error: BaseException) -> list[str]:
     return [line for line in lines if line] or [type(error).__name__]
 
 
+def with_type(kind: str, said: str) -> str:
+    """`ValueError: said`; the type's name alone where an error says nothing."""
+    return f"{kind}: {said}" if said else kind
+
+
 class GmijaxError(Exception):
     """Base of all errors that gmijax raises on purpose."""
 

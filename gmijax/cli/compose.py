@@ -75,6 +75,8 @@ def compose(*overrides: str, command: str = "train", env: Callable[..., Any] | N
     Raises:
       ConfigError: an unknown key, a wrong type or value, or a function that is in no file.
     """
+    if wrong := [one for one in overrides if not isinstance(one, str)]:
+        raise ConfigError(f"{wrong[0]!r}: expected key=value, a text")
     chosen = () if env is None else (f"env={reference(env)}",)
     if command not in _COMPOSED:
         raise ConfigError(f"command={command}: expected one of {', '.join(_COMPOSED)}")

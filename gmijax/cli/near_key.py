@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
-from gmijax.config.schema import suggestion
+from gmijax.config import ALGORITHMS
 
 _ELSEWHERE: Mapping[str, str] = MappingProxyType(
     {
@@ -20,6 +20,8 @@ _ELSEWHERE: Mapping[str, str] = MappingProxyType(
         **dict.fromkeys(("n_envs", "envs"), "num_envs"),
         **dict.fromkeys(("n_steps", "num_steps"), "algo.unroll_length"),
         **dict.fromkeys(("steps", "timesteps", "total_timesteps"), "num_timesteps"),
+        **dict.fromkeys(("tau", "polyak"), "algo.target_rate"),
+        **dict.fromkeys(("buffer_size", "replay_size"), "algo.replay_steps"),
     }
 )
 """What Stable-Baselines3, CleanRL and rsl_rl call it."""
@@ -39,6 +41,9 @@ def near_key(key: str, known: Collection[str]) -> str:
     name = key.rpartition(".")[2]
     if (meant := _ELSEWHERE.get(name.lower().replace("-", "_"))) in known:
         return f": did you mean {meant}?"
+    if others := _algorithms_with(meant or key, known):
+        asked = f"did you mean {meant}," if meant else "it is"
+        return f": {asked} a key of algo={', '.join(others)}{'?' if meant else ''}"
     names = {one.rpartition(".")[2] for one in known}
     if close := difflib.get_close_matches(name, sorted(names), n=1, cutoff=0.75):
         so_called = sorted(one for one in known if one.rpartition(".")[2] == close[0])
@@ -48,9 +53,21 @@ def near_key(key: str, known: Collection[str]) -> str:
         return f": did you mean {group[0]}?"  # It chooses a task or an algorithm.
     if near := _by_words(key, known):
         return f": did you mean {near}?"
-    if len(known) <= _MOST_SHOWN or difflib.get_close_matches(key, known, n=1):
-        return suggestion(key, known)
-    return ": see --help all"
+    # Keys of one group begin alike, and would all be close.
+    of_others = [one for one in known if one.rpartition(".")[0] != key.rpartition(".")[0]]
+    if close := difflib.get_close_matches(key, of_others, n=1, cutoff=0.75):
+        return f": did you mean {close[0]}?"
+    if len(known) > _MOST_SHOWN:
+        return ": see --help all"
+    return f"; allowed: {', '.join(sorted(known))}"
+
+
+def _algorithms_with(key: str, known: Collection[str]) -> list[str]:
+    """Names of the algorithms that have such a key, of a command that takes one."""
+    group, _, name = key.partition(".")
+    if group != "algo" or "algo.name" not in known:
+        return []
+    return [one.name for one in ALGORITHMS if name in one.__dataclass_fields__]
 
 
 def _by_words(key: str, known: Collection[str]) -> str | None:
@@ -62,7 +79,8 @@ def _by_words(key: str, known: Collection[str]) -> str | None:
     count = Counter(word for own in words.values() for word in own)
     scores: Counter[str] = Counter()
     for word in _words(key):
-        for close in difflib.get_close_matches(word, count, n=1, cutoff=0.8):
+        shortened = sorted(one for one in count if len(word) > 4 and one.startswith(word))
+        for close in difflib.get_close_matches(word, count, n=1, cutoff=0.8) or shortened[:1]:
             scores.update({one: 1 / count[close] for one, own in words.items() if close in own})
     group = key.rpartition(".")[0]
 

@@ -79,6 +79,14 @@ def require_between(key: str, value: float, low: float, high: float) -> None:
         raise ConfigError(f"{key}={value!r}: must be between {low} and {high}")
 
 
+def require_config(config: object, cls: type[Any]) -> None:
+    """Raises ConfigError unless `config` is one of `cls`: overrides alone are none."""
+    if not isinstance(config, cls):
+        raise ConfigError(
+            f"config={config!r}: expected a {cls.__name__}; gmijax.compose makes one"
+        )
+
+
 @functools.cache
 def _hints(cls: type[Any]) -> dict[str, Any]:
     """Types of the fields; half of the time of a large sweep if they are evaluated each time."""

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from gmijax.cluster.cluster_job import ClusterJob
 from gmijax.config import TrainConfig
-from gmijax.config.schema import to_dict
+from gmijax.config.schema import require_config, to_dict
 from gmijax.control.console import Show, announce, nearby, open_console, print_next
 from gmijax.control.decide import JobSpec, decide, with_task
 from gmijax.control.films import filmed, find_opengl
@@ -84,6 +84,7 @@ def train(config: TrainConfig, *, show: Show = False) -> Result:
         resume.
     """
     started_s = time.monotonic()
+    require_config(config, TrainConfig)
     config = with_task(config)
     require_wandb(config)
     start_point = find_start_point(config)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from gmijax.autotune.tuner import Search, SearchResult, is_auto, workload_of
 from gmijax.config import TrainConfig
-from gmijax.config.schema import to_dict
+from gmijax.config.schema import require_config, to_dict
 from gmijax.control.console import Show, nearby, open_console, print_next
 from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError
@@ -30,6 +30,7 @@ def search(
       GmijaxError: no point can run.
       JobInterrupted: SIGINT, SIGTERM or SIGHUP came; the profiles so far are kept.
     """
+    require_config(config, TrainConfig)
     if config.run.resume is not None:
         raise ConfigError(
             f"run.resume={config.run.resume}: not for a search, which continues by itself from "

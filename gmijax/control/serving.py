@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 from rich.console import Console
 
 from gmijax.config import ServeConfig
-from gmijax.config.schema import to_dict
+from gmijax.config.schema import require_config, to_dict
 from gmijax.control.console import Show, announce, nearby, open_console, print_next
 from gmijax.control.decide import decide, with_task
 from gmijax.control.progress import ConsoleProgress
@@ -103,6 +103,7 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
       GmiFailed: a GMI failed; finished shards of experience stay.
       JobInterrupted: SIGINT, SIGTERM or SIGHUP came; the same command goes on with what is there.
     """
+    require_config(config, ServeConfig)
     console = open_console(show=show)
     job = _prepared(config, console)
     folders: list[OpenFolder] = []

@@ -13,6 +13,7 @@ from pathlib import Path
 from gmijax.config.pack import PackConfig
 from gmijax.errors import ConfigError
 from gmijax.packs.template import fill, require_names
+from gmijax.runs.folder import why_no_folder
 from gmijax.sweeps.any_job import label_of
 from gmijax.sweeps.paths import DIGITS
 from gmijax.sweeps.progress import Progress
@@ -127,4 +128,4 @@ def require_programs(jobs: Sequence[CommandJob], settings: PackConfig) -> None:
         return
     for folder in dict.fromkeys(job.folder(Path("{run_dir}"), settings.cwd) for job in jobs):
         if not folder.startswith("{run_dir}") and not os.path.isdir(folder):
-            raise ConfigError(f"pack.cwd={folder}: no such folder")
+            raise ConfigError(f"pack.cwd={folder}: {why_no_folder(folder)}")

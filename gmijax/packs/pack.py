@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+import typing
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self, cast
@@ -84,7 +85,7 @@ class PackWork(Work[CommandJob]):
             try:
                 plan = plan_slots(settings, host.machine, {self.ranking.backend})
             except ConfigError as error:
-                raise ConfigError(str(error).replace("plan.backend", "pack.backend")) from None
+                raise ConfigError(_with_own_backends(str(error))) from None
             sites.append(Site(plan, host.machine, host.name))
         return sites
 
@@ -220,6 +221,8 @@ def pack_of(
     if settings.copies is not None and space:
         raise ConfigError("pack.copies: not with a grid; leave out one of them")
     require_names([*command, *templates_of(settings)], list(space))
+    if empty := [key for key, values in space.items() if values == Choices(())]:
+        raise ConfigError(f"{empty[0]}: an empty list")
     points = grid(space, "pack") if settings.sampler == "grid" else corners(space)
     if settings.copies is not None:
         points = [{}] * settings.copies
@@ -251,6 +254,27 @@ def pack(
     Raises:
       ConfigError, SweepFailed, JobInterrupted: as `run_work`.
     """
-    space = {key: Choices(tuple(map(str, values))) for key, values in (grid or {}).items()}
+    command = _listed("command", command)
+    if wrong := [word for word in command if not isinstance(word, str)]:
+        raise ConfigError(f"command: {wrong[0]!r}: expected text")
+    lists = {key: _listed(key, values) for key, values in (grid or {}).items()}
+    space = {key: Choices(tuple(map(str, values))) for key, values in lists.items()}
     own = from_dict(PackConfig, settings)
     return run_work(pack_of(own, space, command, Folder(run_dir, None)), show=show)
+
+
+def _listed(key: str, values: Iterable[Any]) -> tuple[Any, ...]:
+    if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
+        raise ConfigError(f"{key}={values!r}: expected a list")
+    return tuple(values)
+
+
+def _with_own_backends(said: str) -> str:
+    """What a planner says, without backends that `pack.backend` does not take."""
+    said = said.replace("plan.backend=cpu (or CUDA_VISIBLE_DEVICES=-1)", "CUDA_VISIBLE_DEVICES=-1")
+    said = said.replace(" (any number is allowed with plan.backend=cpu)", "")
+    said = said.replace("use plan.backend=mig, or choose", "choose")
+    said, here, names = said.partition("; available here: ")
+    own = typing.get_args(typing.get_type_hints(PackConfig)["backend"])
+    kept = ", ".join(name for name in names.split(", ") if name in own)
+    return f"{said}{here}{kept}".replace("plan.backend", "pack.backend")

@@ -203,6 +203,11 @@ def given_run(run_dir: str | None, name: str | None) -> Path | None:
     return RUNS / name if name else None
 
 
+def why_no_folder(path: str | os.PathLike[str]) -> str:
+    """What to say of a path that is no folder."""
+    return "is not a folder" if os.path.exists(path) else "no such folder"
+
+
 def require_new_run(run_dir: str | None, name: str | None, hint: str = "") -> None:
     """Raises ConfigError if the run folder that the user names exists already.
 

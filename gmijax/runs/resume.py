@@ -15,7 +15,7 @@ from gmijax.runs.checkpoints import (
     newest_checkpoint,
     what_is_broken,
 )
-from gmijax.runs.folder import META, RUNS, RunPaths, read_json
+from gmijax.runs.folder import META, RUNS, RunPaths, read_json, why_no_folder
 from gmijax.runs.held import is_locked
 from gmijax.runs.names import nearby
 
@@ -82,7 +82,8 @@ def _no_checkpoint(folder: Path) -> str:
 def _named(wanted: str, key: str) -> Path:
     folder = last_run(key) if wanted == "last" else Path(wanted)
     if not os.path.isdir(folder):  # Unlike `Path.is_dir` it takes any text.
-        raise ConfigError(f"{key}={wanted}: no such folder{_near_folder(folder)}")
+        near = "" if os.path.exists(folder) else _near_folder(folder)
+        raise ConfigError(f"{key}={wanted}: {why_no_folder(folder)}{near}")
     return folder
 
 

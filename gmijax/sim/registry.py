@@ -219,6 +219,8 @@ def make_env(
         that cannot be had, a length below 1, or a length for `brax`, whose `EpisodeWrapper`
         takes it; or `jax_enable_x64` is on.
     """
+    if not isinstance(name, str):
+        raise ConfigError(f"name={name!r}: expected the name of a task")
     _require_api(api, episode_length)
     if episode_length is not None:
         episode_length = whole_number("env.episode_length", episode_length)

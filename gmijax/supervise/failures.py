@@ -18,6 +18,7 @@ from gmijax.errors import (
     PipeClosed,
     ReportedError,
     printable,
+    with_type,
 )
 
 _GPU_FAULT = re.compile(r"CUDA_ERROR_(?!OUT_OF_MEMORY)|ended by SIGABRT|MPS daemon")
@@ -40,7 +41,7 @@ def describe_exit(
     gmi: int, exit_code: int, error: ReportedError | None, stderr: Path, iteration: int = 0
 ) -> GmiFailed:
     """Puts together what the GMI left behind: its own error, else its last line on stderr."""
-    own = f"{error.type}: {first_line(error.message)}" if error else last_line(stderr)
+    own = with_type(error.type, first_line(error.message)) if error else last_line(stderr)
     how = f"exit code {exit_code}" if exit_code >= 0 else f"ended by {signal_name(-exit_code)}"
     if _NOTHING_FITS in own:
         own += " (perhaps there is too little GPU memory: fewer environments need less)"

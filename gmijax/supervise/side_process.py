@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from gmijax.clock import wait_for
+from gmijax.errors import with_type
 from gmijax.machine.interpreter import command
 from gmijax.machine.processes import GuardPipe
 from gmijax.supervise.failures import last_line, signal_name
@@ -106,7 +107,7 @@ def exit_code_beside(work: Callable[[], None]) -> int:
         work()
     # Whatever it is, training goes on without it.
     except Exception as error:
-        sys.stderr.write(f"{type(error).__name__}: {' '.join(str(error).split())}\n")
+        sys.stderr.write(with_type(type(error).__name__, " ".join(str(error).split())) + "\n")
         return 1
     return 0
 

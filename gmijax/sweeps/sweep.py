@@ -11,7 +11,7 @@ from typing import Any, Final, Self, cast
 from rich.console import Console
 
 from gmijax.config import ClusterConfig, TrainConfig
-from gmijax.config.schema import from_dict, to_dict
+from gmijax.config.schema import from_dict, require_config, to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import Show, nearby
 from gmijax.control.decide import with_task
@@ -157,6 +157,8 @@ def sweep(configs: Sequence[TrainConfig], *, show: Show = False, **settings: Any
     Raises:
       ConfigError, SweepFailed, JobInterrupted: as `run_work`.
     """
+    for config in configs:
+        require_config(config, TrainConfig)
     clusters = {config.cluster for config in configs}
     if len(clusters) > 1:
         raise ConfigError("cluster: a sweep has one; give all configurations the same")

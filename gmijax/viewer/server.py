@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import http
 import io
+import logging
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
@@ -111,13 +112,21 @@ def _guarded(guard: Guard, listening: socket.socket) -> Iterator[list[bool]]:
             refused = _check(guard, request)
             return refused if refused is not None else process_request(connection, request)
 
-        return real(handler, sock=listening, process_request=checked, **others)
+        others |= {"sock": listening, "process_request": checked, "logger": _logger()}
+        return real(handler, **others)
 
     websockets.asyncio.server.serve = serve
     try:
         yield used
     finally:
         websockets.asyncio.server.serve = real
+
+
+def _logger() -> logging.Logger:
+    """What websockets complains to: not of what is no request, which anybody may send."""
+    logger = logging.Logger("gmijax.viewer", logging.WARNING)
+    logger.addFilter(lambda record: record.getMessage() != "opening handshake failed")
+    return logger
 
 
 def _check(guard: Guard, request: Request) -> Response | None:

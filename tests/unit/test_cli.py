@@ -44,6 +44,13 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "hidden_sizes=[8]", "_sizes: did you mean algo.policy_hidden_layer_sizes?"),
     ("train", "algo.num_layers=2", "_layers: did you mean algo.policy_hidden_layer_sizes?"),
     ("train", "algo.zzz=2", "unknown key algo.zzz: see --help all"),
+    ("train", "algo=sac algo.entropy_cost=1", "algo.entropy_cost: it is a key of algo=ppo, a3c\n"),
+    ("train", "algo.tau=1", "algo.tau: did you mean algo.target_rate, a key of algo=sac?"),
+    ("train", "algo.activ=relu", "unknown key algo.activ: did you mean algo.activation?"),
+    ("train", "algo.zeta=1", "unknown key algo.zeta: see --help all\n"),
+    ("train", "cluster.node=1", "unknown key cluster.node: did you mean cluster.nodes?"),
+    ("train", "cluster.rest=1", "unknown key cluster.rest: see --help all\n"),
+    ("train", "rundir=x", "unknown key rundir: did you mean run.dir?"),
     ("train", "ent=ant", "unknown key ent: did you mean env?"),
     ("train", "--num-envs=64", "unknown option --num-envs=64; allowed: --help, --verbose, "),
     ("train", "--num-envs=64", "; did you mean num_envs=64?"),
@@ -256,6 +263,20 @@ REFUSED: list[tuple[str, str, str]] = [
     ("play", f"checkpoint={LONG}", "aaa: expected the folder of a checkpoint"),
     ("play", f"checkpoint='{'9' * 5000}'", "999: expected the folder of a checkpoint"),
 ]
+
+
+@pytest.mark.parametrize(
+    ("command", "key"),
+    [*((one, "run.dir") for one in ("play", "export", "view", "serve")), ("train", "run.resume")],
+)
+def test_a_file_in_place_of_a_run_folder_is_said_to_be_no_folder(
+    command: str, key: str, tmp_path: Path
+) -> None:
+    (tmp_path / "policy.npz").write_text("x")
+    (tmp_path / "policy").mkdir()
+    done = run(command, f"{key}=policy.npz", cwd=tmp_path)
+    assert done.stderr == f"gmijax.{command}: {key}=policy.npz: is not a folder\n"
+    assert done.code == 2
 
 
 @pytest.mark.parametrize(("command", "line", "said"), REFUSED)

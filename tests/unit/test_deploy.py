@@ -108,6 +108,7 @@ def test_observations_of_another_shape_are_refused(policy: Any, shape: tuple[int
     ("name", "said"),
     [
         ("nowhere", "no such folder"),
+        ("bad.npz", "bad.npz: is not a folder$"),
         ("", "no checkpoint in this folder"),
         ("nowhere.onnx", "no such file"),
         ("nowhere.stablehlo", "no such file"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import signal
 from collections.abc import Sequence
 from contextlib import closing
@@ -11,14 +13,16 @@ from typing import Any
 
 import pytest
 from command_lines import run
-from supervision import machine
+from supervision import gpu, machine
 
+import gmijax
 from gmijax.cli.pack import build_pack
 from gmijax.config.pack import PackConfig
 from gmijax.control.console import open_console
 from gmijax.errors import ConfigError
 from gmijax.machine.mps_control import MEMORY_LIMIT_VARIABLE, PIPE_VARIABLE
-from gmijax.machine.nvidia import GpuLoad
+from gmijax.machine.nvidia import GpuLoad, MigInstance
+from gmijax.machine.snapshot import Machine
 from gmijax.packs import slot_limiter
 from gmijax.packs.command_job import CommandJob
 from gmijax.packs.command_kind import CommandKind, PackPaths
@@ -34,6 +38,8 @@ from gmijax.sweeps.work import Folder
 
 COMMAND = ("true", "--seed", "{seed}")
 GPU = machine(1, cpu_cores=tuple(range(16)), mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
+INSTANCE = MigInstance("MIG-0", "1g.18gb", 1, 16, 16384)
+DIVIDED = replace(GPU, gpus=(gpu(0, mig_enabled=True)._replace(instances=(INSTANCE,)), gpu(1)))
 
 
 def commands(work: PackWork) -> list[tuple[str, ...]]:
@@ -119,7 +125,8 @@ def test_bad_input_is_refused(words: Sequence[str], command: Sequence[str], said
         (("--", "no-such-program"), "no-such-program: no such program"),
         (("py=true,no-such", "--", "{py}"), "no-such: no such program"),
         (("pack.cwd=/nothing", "--", "true"), "pack.cwd=/nothing: no such folder"),
-        (("pack.gpus=3", "--", "true"), "pack.gpus=3"),
+        (("pack.cwd=/dev/null", "--", "true"), "pack.cwd=/dev/null: is not a folder"),
+        (("pack.gpus=3", "--", "true"), "pack.gpus=3: this machine has 1 usable GPUs\n"),
         (("pack.backend=x", "--", "true"), "pack.backend=x: expected one of auto, mps, share"),
         (("pack.stall_s=0", "--", "true"), "pack.stall_s=0"),
         (("pack.x=1", "--", "true"), "unknown key pack.x"),
@@ -130,6 +137,71 @@ def test_nothing_is_started_for_bad_input(argv: Sequence[str], said: str, tmp_pa
     assert (done.code, done.stdout) == (2, "")
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("here", "backend", "said"),
+    [
+        (machine(0), "share", "no usable NVIDIA GPU here; available here: auto"),
+        (machine(0), "mps", "no usable NVIDIA GPU here; available here: auto"),
+        (machine(1), "mps", ".*was not found in PATH .*; available here: auto, share"),
+        (
+            machine(1, selection_problem="9 names no GPU"),
+            "auto",
+            "CUDA_VISIBLE_DEVICES=-1 goes on",
+        ),
+        (machine(0, gpu_problem="broken"), "auto", "CUDA_VISIBLE_DEVICES=-1 continues"),
+        (DIVIDED, "mps", "is in MIG mode, and the backend is mps: choose other GPUs"),
+    ],
+)
+def test_only_backends_of_packs_are_named(here: Machine, backend: str, said: str, tmp_path: Path):
+    done = run(
+        "pack",
+        f"pack.backend={backend}",
+        "pack.gpus=[0]",
+        "--",
+        "true",
+        cwd=tmp_path,
+        machine=here,
+    )
+    assert done.code == 2
+    assert re.search(said, done.stderr)
+    assert not re.search("plan[.]|backend=(cpu|mig)|, cpu|, mig", done.stderr)
+
+
+@pytest.mark.parametrize(
+    ("command", "grid", "said"),
+    [
+        (COMMAND, {"seed": []}, "seed: an empty list"),
+        (COMMAND, {"seed": iter(())}, "seed: an empty list"),
+        (COMMAND, {"seed": "abc"}, "seed='abc': expected a list"),
+        (COMMAND, {"seed": 5}, "seed=5: expected a list"),
+        (("true", 5), None, "command: 5: expected text"),
+        ("true 5", None, "command='true 5': expected a list"),
+        (5, None, "command=5: expected a list"),
+        ((), None, "no command: expected"),
+    ],
+)
+def test_what_is_no_grid_is_refused_before_a_folder_is_made(
+    command: Any, grid: Any, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=f"^{said}"):
+        gmijax.pack(command, grid)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_folder_of_a_sweep_is_called_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    request = tmp_path / "all" / "request.json"
+    request.parent.mkdir()
+    for held, said in (
+        ({"jobs": [{"seed": "0"}]}, "holds a sweep; give another folder"),
+        ({"commands": [["true"]], "jobs": [{}]}, "holds another pack; give the same command"),
+    ):
+        request.write_text(json.dumps(held))
+        with pytest.raises(ConfigError, match=said):
+            gmijax.pack(COMMAND, {"seed": [0]}, run_dir="all")
 
 
 def test_jobs_share_a_program_up_to_their_first_option() -> None:

@@ -84,6 +84,9 @@ def test_beats_and_errors_reach_whoever_has_the_memory(
     failure = describe_exit(3, 1, seen.read_error(), link.paths.stderr, iteration=7)
     assert failure.reason == "exit code 1: ValueError: first"
     assert (failure.iteration, failure.error) == (7, seen.read_error())
+    link.report_error(KeyboardInterrupt())
+    told = describe_exit(3, 1, seen.read_error(), link.paths.stderr)
+    assert told.reason == "exit code 1: KeyboardInterrupt"
 
 
 def test_an_error_is_told_where_nothing_can_be_written(

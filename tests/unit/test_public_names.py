@@ -5,10 +5,12 @@ from __future__ import annotations
 import importlib
 import subprocess
 import sys
+from collections.abc import Callable
 
 import pytest
 
 import gmijax
+from gmijax.errors import ConfigError
 
 
 def test_every_public_name_can_be_had() -> None:
@@ -21,6 +23,25 @@ def test_a_function_stays_what_it_is_when_the_command_of_its_name_is_imported() 
     for name in ("train", "serve", "search", "sweep"):
         assert callable(importlib.import_module(f"gmijax.{name}").main)
         assert getattr(gmijax, name).__name__ == name
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: gmijax.train("env=ant"), "config='env=ant': expected a TrainConfig; gmijax.comp"),
+        (lambda: gmijax.search(None), "config=None: expected a TrainConfig"),
+        (lambda: gmijax.serve(gmijax.compose()), "config=TrainConfig.*: expected a ServeConfig"),
+        (lambda: gmijax.sweep(["seed=0"]), "config='seed=0': expected a TrainConfig"),
+        (lambda: gmijax.compose(5), "5: expected key=value"),
+        (lambda: gmijax.make_env(None), "name=None: expected the name of a task"),
+        (lambda: gmijax.make_vector_env(5, 2), "name=5: expected the name of a task"),
+    ],
+)
+def test_what_is_of_another_type_is_refused_in_one_line(
+    call: Callable[[], object], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"^{said}"):
+        call()
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

@@ -106,6 +106,11 @@ def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pyte
         ("def make(", "def mak(", r"no function make there: did you mean mak\?$"),
         # Not what it imports.
         ("def make(", "from os.path import join\ndef start(", r"there; allowed: start$"),
+        (
+            "return Env(",
+            "assert False\n    return Env(",
+            r"fails: AssertionError \(.*point\.py:\d+\)$",
+        ),
         ("def make(", "def make(:", r"point\.py fails: SyntaxError: .*line 8\)$"),
         (
             "import jax.",

@@ -280,4 +280,7 @@ def test_the_folder_of_another_sweep_is_left_alone(
     paths.request.write_text(json.dumps({"jobs": []}))
     assert run("run.dir=all") == 2
     assert "holds another sweep" in capsys.readouterr().err
+    paths.request.write_text(json.dumps({"commands": [], "jobs": []}))
+    assert run("run.dir=all") == 2
+    assert "holds a pack; give another folder" in capsys.readouterr().err
     assert paths.request.exists()

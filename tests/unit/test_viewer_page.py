@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import queue
 import socket
 import subprocess
@@ -10,6 +11,7 @@ import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -115,6 +117,40 @@ def test_the_right_one_gets_the_scene_and_the_panel(client: Client) -> None:
         )
     assert client.wait_for("BatchedGlbMessage")["name"].startswith("/bodies/")
     assert not client.wait_for("ThemeConfigurationMessage")["show_share_button"]
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"\x16\x03\x01\xff\0\n" * 99,
+        b"GET /" + b"a" * 200_000 + b" HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\n" + b"A: b\r\n" * 100_000 + b"\r\n",
+        b"GET //[ HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+    ],
+)
+def test_what_is_no_request_prints_nothing(
+    sent: bytes,
+    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # In a process where a page was asked for, viser hides it.
+    monkeypatch.setattr(logging.getLogger("websockets.server"), "filters", [])
+    served = open_server(Guard("127.0.0.1"), 0)
+    try:
+        with (
+            suppress(ConnectionError),
+            socket.create_connection(("127.0.0.1", served.get_port())) as connection,
+        ):
+            connection.sendall(sent)
+            connection.shutdown(socket.SHUT_WR)
+            while connection.recv(4096):
+                pass
+        assert status_of(served.url) == 200
+    finally:
+        close_server(served)
+    assert capfd.readouterr() == ("", "")
+    assert not caplog.records  # pytest keeps what a logger would have printed.
 
 
 def test_nobody_can_open_a_public_tunnel(

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, with_type
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.types import PyTree
 
@@ -105,9 +105,8 @@ def attempt(what: str, function: Callable[..., Any], *arguments: Any, **named: A
     except (Exception, SystemExit) as error:
         lines = str(error).strip().splitlines() or [""]
         found = f"; {_FOUND}" if isinstance(error, ModuleNotFoundError) else ""
-        raise ConfigError(
-            f"{what} fails: {type(error).__name__}: {lines[0]}{_place(error)}{found}"
-        ) from error
+        said = with_type(type(error).__name__, lines[0])
+        raise ConfigError(f"{what} fails: {said}{_place(error)}{found}") from error
 
 
 def _place(error: BaseException) -> str:
