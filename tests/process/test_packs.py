@@ -256,8 +256,8 @@ def test_what_a_job_leaves_outside_its_group_is_named(
     try:
         with pytest.raises(SweepFailed, match=r"still runs in its folder: end it \(kill (\d+)\)"):
             pack([sys.executable, "-c", LEAVES], run_dir="all", copies=1, max_restarts=1)
-        log = (tmp_path / "all" / "000" / "pack" / "output.log").read_text()
     finally:
+        log = (tmp_path / "all" / "000" / "pack" / "output.log").read_text()
         left = [int(word) for word in re.findall(r"^pid (\d+)", log, re.MULTILINE)]
         for pid in left:
             os.kill(pid, signal.SIGKILL)
@@ -288,7 +288,10 @@ def test_a_killed_pack_leaves_nothing_of_a_group_whose_leader_has_ended(
     finally:
         job.kill()
         job.wait()
-    assert not wait_until_gone([child], timeout_s=60)
+    left = wait_until_gone([child], timeout_s=60)
+    for process in left:
+        os.kill(process.pid, signal.SIGKILL)
+    assert not left
 
 
 def number_in(path: Path) -> str:
