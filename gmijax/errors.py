@@ -15,6 +15,7 @@ GmijaxError
 ├── ParameterMismatch        GMIs that must hold equal parameters do not
 ├── SelfCheckFailed          matrix products are wrong on the share of a GMI
 ├── NonFiniteError           a loss, gradient or simulation became NaN or infinite
+├── JobNotStarted            one job of a sweep or a pack cannot be started; others can
 ├── SweepFailed              jobs of a sweep failed; the others have run
 └── JobInterrupted           the user asked the job to stop; commands exit with code 130
 """
@@ -182,6 +183,10 @@ class SelfCheckFailed(GmijaxError):
 
 class NonFiniteError(GmijaxError):
     """A loss, gradient or simulation became NaN or infinite; the message says where."""
+
+
+class JobNotStarted(GmijaxError):
+    """One job of a sweep or a pack cannot be started, others can; the message does not name it."""
 
 
 class SweepFailed(GmijaxError):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 from gmijax.clock import running_s, wait_for
+from gmijax.errors import printable
 
 _POLL_S = 0.02
 _ENDED = (b"Z", b"X")
@@ -91,6 +92,28 @@ def members_of(group: int) -> tuple[ProcessId, ...]:
             if its_group == group and state not in _ENDED:
                 found.append(process)
     return tuple(found)
+
+
+def that_have_open(path: Path) -> dict[int, str]:
+    """Numbers and names of the processes of this host that have a file open, as far as is known.
+
+    Those of other users are not.
+    """
+    found = {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # It may end meanwhile.
+            if any(_leads_to(fd, path) for fd in (entry / "fd").iterdir()):
+                name = (entry / "comm").read_text(errors="replace")
+                found[int(entry.name)] = printable(name.strip())
+    return found
+
+
+def _leads_to(fd: Path, path: Path) -> bool:
+    try:
+        # First by name: what lies on a network is not asked for nothing.
+        return Path(os.readlink(fd)).name == path.name and os.path.samefile(fd, path)
+    except OSError:
+        return False
 
 
 def wait_until_gone(processes: Iterable[ProcessId], timeout_s: float) -> tuple[ProcessId, ...]:

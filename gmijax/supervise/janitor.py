@@ -15,20 +15,32 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from gmijax.clock import running_s
 from gmijax.errors import BackendUnavailable
 from gmijax.machine.interpreter import command
 from gmijax.machine.mps_control import MpsControl
-from gmijax.machine.processes import GuardPipe, ProcessId, has_ended, identify, wait_until_gone
+from gmijax.machine.processes import (
+    GuardPipe,
+    ProcessId,
+    has_ended,
+    identify,
+    members_of,
+    wait_until_gone,
+)
 
 _GMIS_END_THEMSELVES_S = 8.0
 _DAEMON_ENDS_S = 10.0
 _LATE_DAEMON_S = 2.0
+_POLL_S = 0.1
+
+_Groups: TypeAlias = Mapping[int, set[ProcessId]]
+"""Process groups by number, with members that are known."""
 
 
 class JanitorLink:
@@ -61,10 +73,15 @@ class JanitorLink:
         """Makes the janitor quit this daemon and remove its pipe directory; tell it before."""
         self._tell({"daemon": str(control.pipe_directory), "program": str(control.program)})
 
-    def watch_gmi(self, pid: int) -> None:
-        """Makes the janitor wait for this process group, and kill it if it stays."""
+    def watch_gmi(self, pid: int, group: int | None = None) -> None:
+        """Makes the janitor wait for the process group of this process, and kill it if it stays.
+
+        Args:
+          pid: of the group's leader, or of another member.
+          group: its number; None: that of the process.
+        """
         if process := identify(pid):
-            self._tell({"gmi": list(process)})
+            self._tell({"gmi": list(process), "group": group or pid})
 
     def dismiss(self) -> None:
         """Says that everything is clean and waits for the janitor to end."""
@@ -109,7 +126,7 @@ def main() -> int:
     """Reads messages until the pipe ends, then cleans up unless the controller has."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    gmis: list[ProcessId] = []
+    groups: defaultdict[int, set[ProcessId]] = defaultdict(set)
     daemons: list[MpsControl] = []
     for line in sys.stdin:
         message: dict[str, Any] = json.loads(line)
@@ -118,9 +135,9 @@ def main() -> int:
         if "daemon" in message:
             daemons.append(MpsControl(Path(message["program"]), Path(message["daemon"])))
         else:
-            gmis.append(ProcessId(*message["gmi"]))
+            groups[message["group"]].add(ProcessId(*message["gmi"]))
     # The GMIs notice by themselves that the controller is gone.
-    if left := wait_until_gone(gmis, _GMIS_END_THEMSELVES_S):
+    if left := _wait_until_empty(groups, _GMIS_END_THEMSELVES_S):
         _kill(left, daemons)
     for control in daemons:
         # The controller may have been killed while it was starting this one.
@@ -131,18 +148,42 @@ def main() -> int:
     return 0
 
 
-def _kill(gmis: Iterable[ProcessId], daemons: Iterable[MpsControl]) -> None:
+def _kill(groups: _Groups, daemons: Iterable[MpsControl]) -> None:
     """Ends GMIs that did not end by themselves, first on the GPU."""
     for control in daemons:
         # All clients of an own daemon are GMIs of the job.
         with suppress(BackendUnavailable):
             for client, server in control.all_client_pids().items():
                 control.terminate_client(server, client)
-    for process in gmis:
-        if process.is_running():
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-    wait_until_gone(gmis, _DAEMON_ENDS_S)
+    left = _with_members(groups)
+    for group in left:
+        with suppress(ProcessLookupError):
+            os.killpg(group, signal.SIGKILL)
+    _wait_until_empty(left, _DAEMON_ENDS_S)
+
+
+def _wait_until_empty(groups: _Groups, timeout_s: float) -> _Groups:
+    """Waits until no group has a member; returns those that have after `timeout_s`."""
+    deadline_s = running_s() + timeout_s
+    left = _with_members(groups)
+    while left and running_s() < deadline_s:
+        time.sleep(_POLL_S)
+        left = _with_members(left)
+    return left
+
+
+def _with_members(groups: _Groups) -> _Groups:
+    """The groups in which a known member runs, with all that run in them now.
+
+    A group keeps its number while it has a member, also without its leader; an empty one may lose
+    it to somebody else's.
+    """
+    running = {
+        group: set(members_of(group))
+        for group, known in groups.items()
+        if any(process.is_running() for process in known)
+    }
+    return {group: members for group, members in running.items() if members & groups[group]}
 
 
 if __name__ == "__main__":

@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from gmijax.clock import running_s
-from gmijax.errors import GmijaxError
-from gmijax.machine.processes import GuardPipe, members_of
+from gmijax.errors import GmijaxError, JobNotStarted
+from gmijax.machine.processes import GuardPipe, ProcessId, members_of
 from gmijax.runs.folder import write_json
 from gmijax.runs.held import try_lock
 from gmijax.supervise.failures import last_line
 
 INTERRUPT_BYTE: Final = b"i"
 """Comes by the lifeline of a controller in place of Ctrl-C."""
+
+_OF_ALL_JOBS: Final = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EROFS),
+    *(errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM),
+)
+"""Errors of a start that the next job would meet too: no disk, descriptors, processes, memory."""
 
 _STAY_S = 15.0
 """Longest wait for the rest of a process group whose leader has ended."""
@@ -74,8 +81,12 @@ class Child:
       process: what is run.
       variables: environment variables of its slot.
 
+    Attributes:
+      rest: what still runs of its process group, once the leader has ended.
+
     Raises:
-      GmijaxError: it cannot be started.
+      JobNotStarted: it cannot be started.
+      GmijaxError: no job can.
     """
 
     def __init__(self, process: Process, variables: Mapping[str, str]) -> None:
@@ -83,32 +94,19 @@ class Child:
         self._is_client, self._is_asked = process.is_client, False
         self._pipe = GuardPipe()
         self._ended_s: float | None = None
+        self.rest: tuple[ProcessId, ...] = ()
         lifeline = (self._pipe.read_end,) if process.has_lifeline else ()
-        held: tuple[int, ...] = ()
         try:
-            if process.lock is not None:
-                held = (_locked(process.lock, process.name),)
-            if process.input_file is not None:
-                write_json(*process.input_file)
-            with process.log.open("ab") as output:
-                self._process = subprocess.Popen(
-                    [*process.arguments, *map(str, lifeline)],
-                    env={**os.environ, **variables, **process.variables},
-                    cwd=process.cwd,
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=output,
-                    pass_fds=(*lifeline, *held),
-                    # Ctrl-C is for the scheduler, which asks its jobs.
-                    start_new_session=True,
-                )
+            with errors_of_one_job(process.cwd):
+                self._process = _popen(process, variables, lifeline)
         except OSError as error:
             self._pipe.close()
             raise GmijaxError(f"{process.name}: cannot be started ({error.strerror})") from None
+        except JobNotStarted:
+            self._pipe.close()
+            raise
         finally:
             os.close(self._pipe.read_end)
-            for fd in held:  # The process has its own.
-                os.close(fd)
 
     @property
     def pid(self) -> int:
@@ -122,7 +120,8 @@ class Child:
             return ChildStatus(None)
         self._ended_s = self._ended_s or running_s()
         is_late = running_s() - self._ended_s >= _STAY_S
-        if members_of(self.pid) and (self._is_asked or not is_late):
+        self.rest = members_of(self.pid)
+        if self.rest and (self._is_asked or not is_late):
             return ChildStatus(None)
         return ChildStatus(code, last_line(self._log))
 
@@ -158,13 +157,63 @@ class Child:
         self._process.wait()
 
 
-def _locked(path: Path, name: str) -> int:
+@contextmanager
+def errors_of_one_job(cwd: str | None = None) -> Iterator[None]:
+    """Turns what stands in the way of one job's start into a `JobNotStarted`.
+
+    Args:
+      cwd: its working folder, which is called so.
+
+    Raises:
+      JobNotStarted: with the reason; the next job may start.
+      OSError: the next job would meet the same.
+    """
+    try:
+        yield
+    except ValueError as error:  # What no command may hold, such as a null byte.
+        raise JobNotStarted(f"cannot be started ({error})") from None
+    except OSError as error:
+        if error.errno in _OF_ALL_JOBS:
+            raise
+        what = "working folder " if cwd is not None and error.filename == cwd else ""
+        where = f"{what}{error.filename}: " if error.filename else ""
+        raise JobNotStarted(f"cannot be started ({where}{error.strerror})") from None
+
+
+def _popen(
+    process: Process, variables: Mapping[str, str], lifeline: tuple[int, ...]
+) -> subprocess.Popen[bytes]:
+    """Starts it in a process group of its own, which holds its lock."""
+    held: tuple[int, ...] = ()
+    try:
+        if process.lock is not None:
+            held = (_locked(process.lock),)
+        if process.input_file is not None:
+            write_json(*process.input_file)
+        with process.log.open("ab") as output:
+            return subprocess.Popen(
+                [*process.arguments, *map(str, lifeline)],
+                env={**os.environ, **variables, **process.variables},
+                cwd=process.cwd,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                pass_fds=(*lifeline, *held),
+                # Ctrl-C is for the scheduler, which asks its jobs.
+                start_new_session=True,
+            )
+    finally:
+        for fd in held:  # The process has its own.
+            os.close(fd)
+
+
+def _locked(path: Path) -> int:
     """A descriptor of the file, which is locked by it.
 
     Raises:
-      GmijaxError: a process of the job still runs.
+      JobNotStarted: a process of the job still runs.
     """
     fd = try_lock(path)
     if fd is None:
-        raise GmijaxError(f"{name}: a process of an earlier command still runs ({path})")
+        raise JobNotStarted(f"a process of an earlier command still runs ({path})")
     return fd

@@ -32,7 +32,9 @@ class JobEvents:
     ) -> None:
         self._stream, self._name = stream, name
         self._jobs, self._paths = jobs, paths
-        self._states = {job.number: (job.progress.state, 0) for job in jobs}
+        self._stages: dict[int, tuple[str, int, str | None]] = {
+            job.number: (job.progress.state, 0, None) for job in jobs
+        }
         self._reported_s = 0.0
         self._reports: dict[int, int] = {}
         self._write(f"{name}_started", run_dir=str(paths.root), jobs=len(jobs))
@@ -44,12 +46,12 @@ class JobEvents:
         now_s = time.monotonic()
         is_due = now_s - self._reported_s >= _PROGRESS_S
         for job in self._jobs:
-            state, attempts = job.progress.state, job.progress.attempts
-            before = self._states.get(job.number, ("waiting", 0))
-            self._states[job.number] = state, attempts
-            if (state, attempts) != before:
-                self._changed(job, state)
-            elif is_due and state == "running":
+            now = job.progress.stage
+            before = self._stages.get(job.number, ("waiting", 0, None))
+            self._stages[job.number] = now
+            if now != before:
+                self._changed(job, now[0])
+            elif is_due and now[0] == "running":
                 self._progress(job)
         if is_due:
             self._reported_s = now_s
@@ -70,6 +72,8 @@ class JobEvents:
         event = "job_ended" if state in _ENDS else "job_waits"
         error, log = progress.error, str(self._paths.log(job.number))
         ends = {"exit_code": progress.exit_code, "error": error, "log": log}
+        if event == "job_waits":
+            ends["note"] = progress.note
         self._write(event, job, state=state, **ends, **_figures(progress))
 
     def _progress(self, job: AnyJob) -> None:

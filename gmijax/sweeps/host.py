@@ -93,11 +93,18 @@ class LocalHost:
 
     def look(self, child: int) -> ChildStatus | None:
         """The newest that is known of a child, None before anything is."""
-        return self._children[child].look()
+        return self._look(self._children[child])
 
     def look_at_all(self) -> dict[int, ChildStatus]:
         """How all children are that are not closed."""
-        return {number: child.look() for number, child in self._children.items()}
+        return {number: self._look(child) for number, child in self._children.items()}
+
+    def _look(self, child: Child) -> ChildStatus:
+        before, status = child.rest, child.look()
+        if self._backend is not None:
+            for process in set(child.rest).difference(before):
+                self._backend.started(process.pid, child.pid)
+        return status
 
     def order(self, child: int, order: Order) -> None:
         """Calls a method of a child."""

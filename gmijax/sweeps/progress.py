@@ -70,6 +70,11 @@ class Progress:
     _first_steps: int = 0
 
     @property
+    def stage(self) -> tuple[State, int, str | None]:
+        """What is told whenever it changes: state, attempts, and what a job waits for."""
+        return self.state, self.attempts, self.note if self.state == "waiting" else None
+
+    @property
     def wall_s(self) -> float:
         """Seconds from its start to its end, or until now."""
         if self.started_s is None:

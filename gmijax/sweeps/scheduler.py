@@ -10,12 +10,12 @@ from typing import Generic
 
 from gmijax.clock import running_s
 from gmijax.config.sweep import Ranking
-from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
+from gmijax.errors import GmijaxError, JobInterrupted, JobNotStarted, NodeLost
 from gmijax.runs.folder import add_event
-from gmijax.runs.held import is_locked
 from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.any_job import J
-from gmijax.sweeps.children import ChildStatus
+from gmijax.sweeps.children import ChildStatus, errors_of_one_job
+from gmijax.sweeps.held_jobs import HeldJobs
 from gmijax.sweeps.host import ChildStart
 from gmijax.sweeps.kind import Kind, Limiter
 from gmijax.sweeps.nodes import Host
@@ -35,10 +35,10 @@ _FIRST_REPORT_S = 120.0
 class Scheduler(Generic[J]):
     """Starts jobs where there is room, reads how far they are, and ends them when told to.
 
-    A job that fails ends alone. But where it shared an MPS daemon, and the fault may have been
-    that of another client, it is run once more, from its last checkpoint and alone on its GPU.
-    Jobs with other faults that may pass, such as a machine that is gone, run again, as often as
-    their kind says.
+    A job that fails, or cannot be started, ends alone. But where it shared an MPS daemon, and the
+    fault may have been that of another client, it is run once more, from its last checkpoint and
+    alone on its GPU. Jobs with other faults that may pass, such as a machine that is gone, run
+    again, as often as their kind says.
 
     Args:
       jobs: those that are known; those that are `waiting` are run. More come from the study.
@@ -69,6 +69,7 @@ class Scheduler(Generic[J]):
         self._kind, self._ranking, self._paths = kind, ranking, paths
         self._slots, self._hosts, self._on_tick = slots, hosts, on_tick
         self._limiter = limiter
+        self._held = HeldJobs(paths)
         self._alone: set[int] = set()
         self._faults: Counter[int] = Counter()
         self._running: dict[int, Running[J]] = {}
@@ -82,7 +83,7 @@ class Scheduler(Generic[J]):
           JobInterrupted: a signal came; all jobs have saved and ended.
           ConfigError: jobs have not what they are to be compared by; all have saved and ended.
           NodeLost: no machine is left.
-          GmijaxError, OSError: a job cannot be started, or the study not be written; all jobs have
+          GmijaxError, OSError: no job can be started, or the study not be written; all jobs have
             saved and ended.
         """
         try:
@@ -109,20 +110,23 @@ class Scheduler(Generic[J]):
 
     def _start_what_fits(self) -> None:
         for job in list(self._queue):
-            # A killed process of the job, or one of a machine that is gone, may still save.
-            if is_locked(self._paths.job(job.number).lock):
-                continue
-            if job.progress.state != "waiting" or self._start_if_it_fits(job):
+            if job.progress.state != "waiting":
+                continue  # Started together with one before it.
+            if self._held.has(job) or self._start_if_it_fits(job):
                 continue
             if not self._sites_to_avoid(job):
                 return  # In order, so that a large job is not passed by forever.
         has_room = self._slots.num_gpus_with_free_slot
-        while not self._queue and has_room() and (job := self._study.next()):
+        while self._held.are_all(self._queue) and has_room() and (job := self._study.next()):
             self._jobs.append(job)
             if not self._start_if_it_fits(job):
                 self._queue.append(job)
+        for job in () if self._running else self._queue:
+            if (why := self._held.why_failed(job)) is not None:
+                self._fail((job,), why)
 
     def _start_if_it_fits(self, job: J) -> bool:
+        """Starts a job if there is room; whether it has left the queue."""
         avoid = self._sites_to_avoid(job)
         if not (num_gpus := self._slots.num_gpus_with_free_slot(avoid)):
             return False
@@ -135,12 +139,23 @@ class Scheduler(Generic[J]):
         )
         if slot is None:
             return False
+        started = together[: slot.size]
         try:
-            self._start(together[: slot.size], slot)
+            self._start(started, slot)
         except NodeLost:
             self._drop_lost()
             return False
+        except JobNotStarted as error:
+            self._slots.release(slot)
+            self._fail(started, str(error))
         return True
+
+    def _fail(self, jobs: tuple[J, ...], why: str) -> None:
+        """Notes that jobs of the queue have failed before they could start."""
+        for job in jobs:
+            job.progress.state, job.progress.error = "failed", why
+            self._close(job)
+        self._queue = [job for job in self._queue if job.progress.state == "waiting"]
 
     def _sites_to_avoid(self, job: J) -> set[int]:
         """Machines where another job compiles the same, which is found in a cache later."""
@@ -152,7 +167,8 @@ class Scheduler(Generic[J]):
 
     def _start(self, jobs: tuple[J, ...], slot: Slot) -> None:
         host, first = self._hosts[slot.site], jobs[0]
-        start = self._kind.start(jobs, slot)
+        with errors_of_one_job():
+            start = self._kind.start(jobs, slot)
         for job in jobs:
             job.progress.read(self._paths.job(job.number), self._ranking)
         child = host.start(ChildStart(slot, start.process))
@@ -225,18 +241,22 @@ class Scheduler(Generic[J]):
             and (end.is_interrupted or end.error)
             and not running.ended_by_shutdown
         ):
-            progress.state, progress.error = "waiting", None
+            progress.state, progress.error, progress.note = "waiting", None, None
             return True
         if end.is_interrupted or (end.is_fault and running.is_pruned):
             progress.state = "pruned" if running.is_pruned else "interrupted"
         elif end.error and (again := self._why_again(running, job, end)):
-            progress.state, progress.error = "waiting", again
+            progress.state, progress.error, progress.note = "waiting", again, None
             add_event(run.events, "again", reason=again)
             return True
-        with suppress(OSError):  # A full disk must not end the sweep.
-            self._kind.ended(job, run)
-        self._tell(job)
+        self._close(job)
         return False
+
+    def _close(self, job: J) -> None:
+        """A job has ended for good."""
+        with suppress(OSError):  # A full disk must not end the sweep.
+            self._kind.ended(job, self._paths.job(job.number))
+        self._tell(job)
 
     def _is_hopeless(self, job: J) -> bool:
         try:

@@ -38,7 +38,7 @@ class SweepView:
 
     def __init__(self, console: Console, jobs: Sequence[AnyJob], ranking: Ranking) -> None:
         self._console, self._jobs, self._ranking = console, jobs, ranking
-        self._states: dict[int, tuple[str, int]] = {}
+        self._stages: dict[int, tuple[str, int, str | None]] = {}
         self._left: defaultdict[int, TimeLeft] = defaultdict(TimeLeft)
         self._display = LiveDisplay(console)
         self._is_stopping = False
@@ -77,13 +77,13 @@ class SweepView:
         return Group(self._table(), Text(self.line())) if self._display.has_panel else None
 
     def _print_changes(self) -> None:
-        """States of jobs that are new; those that the table shows only if one has failed."""
+        """New stages of jobs; beside the table only those that somebody may have to mend."""
         for job in self._jobs:
-            before = self._states.get(job.number, ("waiting", 0))
-            now = job.progress.state
-            self._states[job.number] = now, job.progress.attempts
-            is_new = self._states[job.number] != before
-            if is_new and (now == "failed" or not self._display.has_panel):
+            before = self._stages.get(job.number, ("waiting", 0, None))
+            state, _, waits_for = now = job.progress.stage
+            self._stages[job.number] = now
+            is_due = state == "failed" or waits_for or not self._display.has_panel
+            if now != before and is_due:
                 self._console.print(self._change(job, job.progress))
 
     def _change(self, job: AnyJob, progress: Progress) -> str:
@@ -91,8 +91,8 @@ class SweepView:
         if progress.state == "running":
             where = f" on {progress.slot}" if progress.slot else ""
             return f"{what}{where}{f' ({progress.note})' if progress.note else ''}"
-        if progress.error:
-            return f"{what}: {progress.error}"
+        if words := [word for word in (progress.error, progress.stage[2]) if word]:
+            return f"{what}: {'; '.join(words)}"
         value = ""
         if progress.value is not None:
             found = shown(progress.value, progress.is_full, progress.episodes)

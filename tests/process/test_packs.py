@@ -5,16 +5,21 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 from training_jobs import start, train, wait_until
 
+from gmijax.errors import SweepFailed
+from gmijax.machine.processes import identify, wait_until_gone
 from gmijax.packs.pack import pack
+from gmijax.sweeps import held_jobs
 
 TRAINER = """
 import argparse, importlib.util, signal, sys, time
@@ -203,3 +208,91 @@ def test_without_a_reward_the_table_has_what_is_known_and_a_hint(tmp_path: Path)
     )
     assert lines.index(hint) < heading  # As soon as the first job is complete, and at the end.
     assert lines.count(hint) == 2
+
+
+def test_a_command_that_cannot_be_started_does_not_end_the_others(tmp_path: Path) -> None:
+    (tmp_path / "alien").write_bytes(b"\x7fELF of nothing")
+    (tmp_path / "alien").chmod(0o755)
+    (tmp_path / "late").write_text("#!/bin/sh\n")
+    (tmp_path / "late").chmod(0o755)
+    # The first one runs until the next is refused, and another one has its place until then.
+    wait = "until grep -qs cannot all/pack.json; do sleep 0.1; done; chmod a-x late"
+    until = "while test -x late; do sleep 0.1; done"
+    lines = (f"bash -c '{wait}'", "./alien", f"bash -c '{until}'", "./late", "echo last")
+    (tmp_path / "cmds.txt").write_text("\n".join(lines))
+    words = ("pack.commands=cmds.txt", "pack.jobs_per_gpu=2", "run.dir=all")
+    done = train(*words, cwd=tmp_path, command="pack")
+    assert done.returncode == 1
+    assert f"2 of 5 jobs failed; job 1: cannot be started ({tmp_path}/alien: Exec" in done.stderr
+    found = report(tmp_path / "all")["jobs"]
+    states = [job["state"] for job in found]
+    assert states == ["completed", "failed", "completed", "failed", "completed"]
+    assert found[3]["error"] == f"cannot be started ({tmp_path}/late: Permission denied)"
+
+
+def test_a_missing_working_folder_is_named(tmp_path: Path) -> None:
+    words = ("pack.copies=2", "pack.cwd={run_dir}/sub", "run.dir=all")
+    done = train(*words, "--", "true", cwd=tmp_path, command="pack")
+    assert done.returncode == 1
+    assert f"working folder {tmp_path}/all/000/sub: No such file" in done.stderr
+    assert [job["state"] for job in report(tmp_path / "all")["jobs"]] == ["failed"] * 2
+
+
+LEAVES = """
+import os, sys, time
+if os.fork() == 0:
+    os.setsid()
+    print("pid", os.getpid(), flush=True)
+    time.sleep(600)
+sys.exit(3)
+"""
+
+
+def test_what_a_job_leaves_outside_its_group_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(held_jobs, "_LIMIT_S", 6.0)
+    try:
+        with pytest.raises(SweepFailed, match=r"still runs in its folder: end it \(kill (\d+)\)"):
+            pack([sys.executable, "-c", LEAVES], run_dir="all", copies=1, max_restarts=1)
+    finally:
+        log = (tmp_path / "all" / "000" / "pack" / "output.log").read_text()
+        left = [int(word) for word in re.findall(r"^pid (\d+)", log, re.MULTILINE)]
+        for pid in left:
+            os.kill(pid, signal.SIGKILL)
+    (job,) = report(tmp_path / "all")["jobs"]
+    assert len(left) == 1  # It was not started beside it.
+    assert f"(kill {left[0]})" in job["error"]
+    assert job["error"].endswith("it was to run again, after exit code 3: " + f"pid {left[0]}")
+
+
+@pytest.mark.parametrize("ends", ["before the pack", "after it"])
+def test_a_killed_pack_leaves_nothing_of_a_group_whose_leader_has_ended(
+    ends: str, tmp_path: Path
+) -> None:
+    """The leader ends by itself while the janitor still waits for that."""
+    wait = "while kill -0 $PPID 2>/dev/null; do sleep 0.1; done; sleep 1"
+    script = f"sleep 600 & echo $! > child; echo $$ > leader; {wait if ends == 'after it' else ''}"
+    words = ("pack.copies=1", "run.dir=all")
+    job = start(*words, "--", "bash", "-c", script, cwd=tmp_path, command="pack")
+    try:
+        leader = Path("/proc") / wait_until(
+            lambda: number_in(tmp_path / "leader"), 60.0, "it runs"
+        )
+        child = identify(int((tmp_path / "child").read_text()))
+        assert child is not None
+        if ends == "before the pack":
+            wait_until(lambda: not leader.exists(), 10.0, "the leader has ended")
+            time.sleep(0.5)  # The pack has told its janitor.
+    finally:
+        job.kill()
+        job.wait()
+    left = wait_until_gone([child], timeout_s=60)
+    for process in left:
+        os.kill(process.pid, signal.SIGKILL)
+    assert not left
+
+
+def number_in(path: Path) -> str:
+    return path.read_text().strip() if path.exists() else ""

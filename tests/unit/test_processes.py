@@ -8,7 +8,14 @@ import signal
 import subprocess
 from pathlib import Path
 
-from gmijax.machine.processes import ProcessId, identify, members_of, own_process, wait_until_gone
+from gmijax.machine.processes import (
+    ProcessId,
+    identify,
+    members_of,
+    own_process,
+    that_have_open,
+    wait_until_gone,
+)
 
 
 def test_zombie_is_not_running():
@@ -61,3 +68,20 @@ def test_members_of_a_group_are_those_that_run():
         os.killpg(shell.pid, signal.SIGKILL)
         shell.communicate()
     assert wait_until_gone(members_of(shell.pid), timeout_s=10) == ()
+
+
+def test_who_has_a_file_open(tmp_path: Path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    for name in ("lock", "other"):
+        (tmp_path / "real" / name).touch()
+    assert that_have_open(tmp_path / "link" / "lock") == {}
+    assert that_have_open(tmp_path / "nowhere") == {}
+    with (tmp_path / "real" / "lock").open("rb") as file:
+        child = subprocess.Popen(["sleep", "60"], stdin=file)
+    try:
+        assert that_have_open(tmp_path / "link" / "lock") == {child.pid: "sleep"}
+        assert that_have_open(tmp_path / "real" / "other") == {}
+    finally:
+        child.kill()
+        child.wait()

@@ -6,8 +6,9 @@ import errno
 import json
 import os
 import signal
+import subprocess
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,16 +20,20 @@ from gmijax.cli.command import sweep_command
 from gmijax.cli.compose import compose
 from gmijax.clock import running_s
 from gmijax.config.sweep import SweepConfig
-from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted, JobNotStarted
 from gmijax.runs.folder import read_json
-from gmijax.runs.held import OpenFolder, locked
+from gmijax.runs.held import OpenFolder, is_locked, locked, try_lock
 from gmijax.supervise.stop_signals import StopSignals
-from gmijax.sweeps import report, scheduler
+from gmijax.sweeps import held_jobs, report, scheduler
 from gmijax.sweeps.children import Child, Process
+from gmijax.sweeps.host import ChildStart
 from gmijax.sweeps.jobs import Job, jobs_of
+from gmijax.sweeps.kind import JobStart
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.report import JobsReport
+from gmijax.sweeps.slots import Slot
 from gmijax.sweeps.study import Study
+from gmijax.sweeps.training import TrainingKind
 
 
 @pytest.fixture(autouse=True)
@@ -199,6 +204,138 @@ def test_an_order_that_cannot_be_written_is_named(
         Child(process, {})
     # Not fewer either: garbage of other tests is collected at any moment.
     assert set(os.listdir("/proc/self/fd")) <= before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "cwd", "said"),
+    [
+        (("./alien",), None, "./alien: Exec format error"),
+        (("./no_x",), None, "./no_x: Permission denied"),
+        (("./gone",), None, "./gone: No such file or directory"),
+        (("true",), "./nowhere", "working folder ./nowhere: No such file or directory"),
+        (("true", "\0"), None, "embedded null byte"),
+        (("true", "x" * 2**20), None, "true: Argument list too long"),
+    ],
+)
+def test_what_is_wrong_with_one_command_is_said_and_is_no_error_of_all(
+    arguments: tuple[str, ...],
+    cwd: str | None,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "alien").write_bytes(b"\x7fELF of nothing")
+    (tmp_path / "alien").chmod(0o755)
+    (tmp_path / "no_x").touch()
+    before = set(os.listdir("/proc/self/fd"))
+    lock = tmp_path / ".lock"
+    with pytest.raises(JobNotStarted) as raised:
+        Child(Process("job 003", arguments, tmp_path / "log", cwd=cwd, lock=lock), {})
+    assert str(raised.value) == f"cannot be started ({said})"
+    assert not is_locked(lock)
+    assert set(os.listdir("/proc/self/fd")) <= before
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM])
+def test_what_no_job_can_have_is_an_error_of_all(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: Any, **__: Any) -> Any:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(subprocess, "Popen", refused)
+    with pytest.raises(GmijaxError, match=r"^job 003: cannot be started \(") as raised:
+        Child(Process("job 003", ("true",), tmp_path / "log"), {})
+    assert not isinstance(raised.value, JobNotStarted)
+
+
+class OddFiles(TrainingKind):
+    """Two jobs have files that cannot be opened."""
+
+    def start(self, jobs: tuple[Job, ...], slot: Slot) -> JobStart:
+        if jobs[0].number in (1, 2):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "some/file")
+        return super().start(jobs, slot)
+
+
+@pytest.mark.parametrize("where", ["its files", "its process"])
+def test_a_job_that_cannot_be_started_fails_alone(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep = Sweep(tmp_path, jobs(8))
+    orders = orders_of(sweep, monkeypatch)
+    for node in sweep.nodes:
+
+        def begin(start: ChildStart, old: Any = node.start) -> int:
+            if where == "its process" and start.process.name in ("job 001", "job 002"):
+                raise JobNotStarted("cannot be started (odd)")
+            return old(start)
+
+        monkeypatch.setattr(node, "start", begin)
+    sweep.run(sweep.end_all, kind=OddFiles if where == "its files" else TrainingKind)
+    assert sweep.states() == ["completed", "failed", "failed", *["completed"] * 5]
+    assert all("cannot be started (" in (job.progress.error or "") for job in sweep.jobs[1:3])
+    assert set(orders) == {"close"}
+    assert sweep.slots.num_gpus_with_free_slot() == 2  # Those of the failed ones are free again.
+
+
+@pytest.fixture
+def holder(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that an earlier command has left in the folder of job 1."""
+    lock = SweepPaths(tmp_path).job(1).lock
+    lock.parent.mkdir()
+    fd = try_lock(lock)
+    assert fd is not None
+    process = subprocess.Popen(["sleep", "600"], pass_fds=(fd,))
+    os.close(fd)
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_a_job_whose_folder_a_process_holds_waits_and_then_fails(
+    holder: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock_s, notes = [0.0], set[str]()
+    monkeypatch.setattr(held_jobs, "running_s", lambda: clock_s[0])
+    sweep = Sweep(tmp_path, jobs(6))
+
+    def later() -> None:
+        clock_s[0] += 50.0
+        notes.add(sweep.jobs[1].progress.note or "")
+        if clock_s[0] > 400.0:  # Until then others run.
+            sweep.end_all()
+        if len(sweep.nodes[0].running) + len(sweep.nodes[1].running):
+            assert sweep.jobs[1].progress.state == "waiting"
+
+    sweep.run(later)
+    assert sweep.states() == ["completed", "failed", *["completed"] * 4]
+    what = f"process {holder.pid} (sleep), started earlier, still runs in its folder: end it (kill"
+    assert sweep.jobs[1].progress.error == f"{what} {holder.pid}), then give the same command"
+    (note,) = notes - {""}
+    assert note.startswith(f"{what} {holder.pid}); the job fails if that still runs after 120 s")
+    assert 1 not in [number for node in sweep.nodes for number in node.started]
+
+
+def test_a_job_starts_once_its_folder_is_free(
+    holder: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock_s = [0.0]
+    monkeypatch.setattr(held_jobs, "running_s", lambda: clock_s[0])
+    sweep = Sweep(tmp_path, jobs(2))
+
+    def later() -> None:
+        clock_s[0] += 10.0
+        sweep.end_all()
+        if clock_s[0] == 50.0:
+            assert "still runs in its folder" in (sweep.jobs[1].progress.note or "")
+            holder.kill()
+            holder.wait()
+
+    sweep.run(later)
+    assert sweep.states() == ["completed"] * 2
+    assert sweep.jobs[1].progress.note is None
 
 
 def ended_job() -> list[Job]:

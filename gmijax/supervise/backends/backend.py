@@ -58,10 +58,13 @@ class Backend:
           BackendUnavailable: that cannot be done.
         """
 
-    def started(self, pid: int) -> None:
-        """Tells the backend that a GMI runs as the process group `pid`."""
+    def started(self, pid: int, group: int | None = None) -> None:
+        """Tells the backend that a GMI runs as the process group `pid`.
+
+        Of a `group` whose leader has ended it is told the other members.
+        """
         if self._janitor is not None:
-            self._janitor.watch_gmi(pid)
+            self._janitor.watch_gmi(pid, group)
 
     def verify(self, pids: Mapping[int, int]) -> None:
         """Checks that every GMI really has its share; `pids` is GMI -> process.
