@@ -101,7 +101,7 @@ class ConsoleProgress:
             done_so_far = f", iteration {gmi.iteration}" if gmi.iteration else ""
             grid.add_row(Text(f"GMI {gmi.gmi}: {gmi.state}{done_so_far}", "dim"))
         if self._phases.now != "stopping" and self._has_figures and self._part() == 1:
-            grid.add_row(Text("finishing: saving a checkpoint, measuring the rates", "dim"))
+            grid.add_row(Text("finishing: saving a checkpoint", "dim"))
         return grid
 
     @property

@@ -178,12 +178,14 @@ def _with_members(groups: _Groups) -> _Groups:
     A group keeps its number while it has a member, also without its leader; an empty one may lose
     it to somebody else's.
     """
-    running = {
-        group: set(members_of(group))
-        for group, known in groups.items()
-        if any(process.is_running() for process in known)
-    }
-    return {group: members for group, members in running.items() if members & groups[group]}
+    left: dict[int, set[ProcessId]] = {}
+    for group, known in groups.items():
+        running = {process for process in known if process.is_running()}
+        members = set(members_of(group)) if running else set()
+        # A leader may end between the two looks; by then its group had its number.
+        if members & known or (members and any(one.pid == group for one in running)):
+            left[group] = members
+    return left
 
 
 if __name__ == "__main__":

@@ -23,9 +23,11 @@ INTERRUPT_BYTE: Final = b"i"
 
 _OF_ALL_JOBS: Final = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EROFS),
+    *(errno.EIO, errno.ESTALE, errno.ENOTCONN, errno.ETIMEDOUT),
     *(errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM),
 )
-"""Errors of a start that the next job would meet too: no disk, descriptors, processes, memory."""
+"""Errors of a start that the next job would meet too: no disk or one that is gone, no descriptors,
+processes or memory."""
 
 _STAY_S = 15.0
 """Longest wait for the rest of a process group whose leader has ended."""

@@ -48,6 +48,10 @@ class HeldJobs:
             )
         return True
 
+    def forget(self, job: AnyJob) -> None:
+        """A job has started."""
+        self._since_s.pop(job.number, None)
+
     def are_all(self, jobs: Iterable[AnyJob]) -> bool:
         """Whether all of these wait for such processes; so for none."""
         return all(job.number in self._since_s for job in jobs)

@@ -14,6 +14,7 @@ from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.names import nearby
 from gmijax.runs.saved_config import config_of_run, differences, task_and_algorithm
+from gmijax.sim import source
 from gmijax.sweeps.any_job import label_of
 from gmijax.sweeps.progress import Progress, State
 from gmijax.sweeps.slots import Slot
@@ -130,30 +131,32 @@ def started_in(config: TrainConfig, run: RunPaths) -> TrainConfig:
 
 
 def state_of(run: RunPaths, config: TrainConfig) -> State:
-    """Whether an earlier attempt at the sweep has completed a job.
-
-    Raises:
-      ConfigError: it has, with other settings: jobs of these would be compared with it.
-    """
+    """Whether an earlier attempt at the sweep has completed a job."""
     if not run.summary.exists():
         return "waiting"
     summary = read_json(run.summary)
     steps = summary.get("env_steps")
     is_far = isinstance(steps, int | float) and steps >= config.num_timesteps
-    if summary.get("status") != "completed" or not is_far:
-        return "waiting"
-    if run.config.exists():
-        _require_same(run, config)
-    return "completed"
+    return "completed" if summary.get("status") == "completed" and is_far else "waiting"
 
 
-def _require_same(run: RunPaths, config: TrainConfig) -> None:
+def require_same(run: RunPaths, config: TrainConfig) -> None:
+    """Raises ConfigError if a job is complete with other settings: others are compared with it."""
+    if not (run.summary.exists() and run.config.exists()):
+        return
+    if read_json(run.summary).get("status") != "completed":
+        return
     saved = config_of_run(run)
     env, algo = task_and_algorithm(saved)
     # Keys that its version did not have are as they were without.
     whole = saved | {"env": to_dict(env), "algo": to_dict(algo)}
     changes = differences(whole, to_dict(config))
-    if changed := [text for text in changes if text.startswith(_LEARNT_WITH)]:
+    changed = [text for text in changes if text.startswith(_LEARNT_WITH)]
+    # In the run it is the checkpoint that was found for what the user gave.
+    changed = [text for text in changed if not text.startswith("algo.teacher ")]
+    if edited := source.changes(config.env, saved["env"]):
+        changed.append(edited)
+    if changed:
         raise ConfigError(
             f"{nearby(run.root)}: this job is complete with other settings: {changed[0]}; give "
             "those, or another folder"

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.start_point import find_start_point
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, with_type
 from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.held import is_locked
@@ -140,5 +140,5 @@ def own_end(job: Job, run: RunPaths) -> OwnEnd | None:
         return OwnEnd(None)
     if run.gmi(0).error.exists():
         said = read_json(run.gmi(0).error)
-        return OwnEnd(f"{said.get('type')}: {said.get('message')}")
+        return OwnEnd(with_type(str(said.get("type")), str(said.get("message") or "")))
     return None

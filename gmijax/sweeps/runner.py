@@ -188,6 +188,8 @@ def _run_jobs(
             tick,
             limiter,
         ).run(signals)
+    if not jobs:
+        raise ConfigError(f"{work.name}: no trial had values that are allowed together")
 
 
 @contextmanager

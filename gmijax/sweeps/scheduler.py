@@ -119,7 +119,7 @@ class Scheduler(Generic[J]):
         has_room = self._slots.num_gpus_with_free_slot
         while self._held.are_all(self._queue) and has_room() and (job := self._study.next()):
             self._jobs.append(job)
-            if not self._start_if_it_fits(job):
+            if self._held.has(job) or not self._start_if_it_fits(job):
                 self._queue.append(job)
         for job in () if self._running else self._queue:
             if (why := self._held.why_failed(job)) is not None:
@@ -147,6 +147,9 @@ class Scheduler(Generic[J]):
             return False
         except JobNotStarted as error:
             self._slots.release(slot)
+            if len(started) > 1:  # It may be the fault of one of them.
+                self._alone |= {one.number for one in started}
+                return False
             self._fail(started, str(error))
         return True
 
@@ -176,6 +179,7 @@ class Scheduler(Generic[J]):
             self._compiling.setdefault((slot.site, first.program), first.number)
         self._running[first.number] = Running(jobs, slot, host, child, start.readers)
         for job in jobs:
+            self._held.forget(job)
             job.progress.begin(slot.label, host.name)
         self._queue = [job for job in self._queue if job.progress.state == "waiting"]
 

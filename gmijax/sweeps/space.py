@@ -57,9 +57,9 @@ def grid(space: Space, command: str = "sweep") -> list[dict[str, str]]:
 
 
 def corners(space: Space) -> list[dict[str, str]]:
-    """Points that have every value of every list, and of every interval its ends and one between.
+    """Points that have every value of every list and both ends of every interval.
 
-    What lies between is no whole number, where fractions may be drawn.
+    Where fractions may be drawn they have one too: both ends may be whole numbers.
     """
     columns = {
         key: values.values if isinstance(values, Choices) else _some_of(values)
@@ -74,8 +74,8 @@ def corners(space: Space) -> list[dict[str, str]]:
 
 def _some_of(interval: Interval) -> tuple[str, ...]:
     low, high = interval.low, interval.high
-    between = low + (high - low) / math.pi
-    return tuple(as_text(value, interval) for value in (low, high, between))
+    between = () if interval.is_integer else (low + (high - low) / math.pi,)
+    return tuple(as_text(value, interval) for value in (low, high, *between))
 
 
 def as_text(value: float, interval: Interval) -> str:

@@ -19,7 +19,7 @@ from gmijax.control.large_on_cpu import large_on_cpu
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.stop_signals import StopSignals
-from gmijax.sweeps.jobs import Job, jobs_of, require_placeable, state_of
+from gmijax.sweeps.jobs import Job, jobs_of, require_placeable, require_same, state_of
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.kind import Kind
 from gmijax.sweeps.nodes import Host
@@ -108,6 +108,7 @@ class SweepWork(Work[Job]):
 
     def state_of(self, run: RunPaths, job: Job) -> State:
         """See `Work`."""
+        require_same(run, job.config)
         return state_of(run, job.config)
 
     def described(self) -> dict[str, Any]:
@@ -157,6 +158,9 @@ def sweep(configs: Sequence[TrainConfig], *, show: Show = False, **settings: Any
     Raises:
       ConfigError, SweepFailed, JobInterrupted: as `run_work`.
     """
+    if isinstance(configs, TrainConfig):
+        raise ConfigError("configs: expected a list of configurations; gmijax.train takes one")
+    configs = tuple(configs)
     for config in configs:
         require_config(config, TrainConfig)
     clusters = {config.cluster for config in configs}

@@ -31,6 +31,7 @@ def test_a_function_stays_what_it_is_when_the_command_of_its_name_is_imported() 
         (lambda: gmijax.train("env=ant"), "config='env=ant': expected a TrainConfig; gmijax.comp"),
         (lambda: gmijax.search(None), "config=None: expected a TrainConfig"),
         (lambda: gmijax.serve(gmijax.compose()), "config=TrainConfig.*: expected a ServeConfig"),
+        (lambda: gmijax.sweep(gmijax.compose()), "configs: expected a list of configurations"),
         (lambda: gmijax.sweep(["seed=0"]), "config='seed=0': expected a TrainConfig"),
         (lambda: gmijax.compose(5), "5: expected key=value"),
         (lambda: gmijax.make_env(None), "name=None: expected the name of a task"),

@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -336,6 +336,50 @@ def test_a_job_starts_once_its_folder_is_free(
     sweep.run(later)
     assert sweep.states() == ["completed"] * 2
     assert sweep.jobs[1].progress.note is None
+
+
+def test_a_job_of_a_sampler_waits_for_its_folder_too(
+    holder: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock_s, drawn = [0.0], jobs(2)
+    monkeypatch.setattr(held_jobs, "running_s", lambda: clock_s[0])
+    sweep = Sweep(tmp_path, drawn[:1])
+
+    class Drawn(Study[Job]):
+        def next(self) -> Job | None:
+            return drawn.pop() if len(drawn) == 2 else None
+
+    monkeypatch.setattr("test_sweep_nodes.Study", Drawn)
+
+    def later() -> None:
+        clock_s[0] += 10.0
+        sweep.end_all()
+        if clock_s[0] == 50.0:
+            assert "still runs in its folder" in (sweep.jobs[1].progress.note or "")
+            holder.kill()
+            holder.wait()
+
+    sweep.run(later)
+    assert clock_s[0] >= 50.0
+    assert sweep.states() == ["completed"] * 2
+
+
+class OddFileOfOne(TrainingKind):
+    """Jobs share a program, and one of them has a file that cannot be opened."""
+
+    def together(self, job: Job, queue: Sequence[Job], alone: Collection[int]) -> tuple[Job, ...]:
+        return (job,) if job.number in alone else tuple(queue)
+
+    def start(self, jobs: tuple[Job, ...], slot: Slot) -> JobStart:
+        if any(job.number == 1 for job in jobs):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "some/file")
+        return super().start(jobs[:1], slot)
+
+
+def test_of_jobs_of_one_program_that_cannot_start_only_the_odd_one_fails(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path, jobs(3))
+    sweep.run(sweep.end_all, kind=OddFileOfOne)
+    assert sweep.states() == ["completed", "failed", "completed"]
 
 
 def ended_job() -> list[Job]:

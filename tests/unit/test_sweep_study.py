@@ -72,6 +72,15 @@ def test_values_that_are_not_allowed_together_are_left_out_and_the_others_go_on(
     assert again.next() is None
 
 
+def test_between_the_ends_of_whole_numbers_nothing_is_asked_before(tmp_path: Path) -> None:
+    size = "num_envs=int(interval(8,64))"
+    trials = study(
+        tmp_path, size, "algo.num_minibatches=128", "sweep.sampler=random", "sweep.trials=3"
+    )
+    while trials.next():
+        pass
+
+
 def test_a_study_goes_on_with_what_was_running_and_what_failed(tmp_path: Path) -> None:
     first = study(tmp_path, *TOY)
     jobs = [job for _ in range(5) if (job := first.next()) is not None]

@@ -32,7 +32,7 @@ from gmijax.sweeps import curve_window, jobs_per_gpu, runner
 from gmijax.sweeps.by_setting import name_of_middle, seed_summary
 from gmijax.sweeps.curve_window import CurveWindow
 from gmijax.sweeps.host import LocalHost
-from gmijax.sweeps.jobs import Job, jobs_of, placed, require_placeable, state_of
+from gmijax.sweeps.jobs import Job, jobs_of, placed, require_placeable, require_same, state_of
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.objective import require_logged, why_not_comparable, with_objective
 from gmijax.sweeps.packs import most_together, require_packable
@@ -462,13 +462,37 @@ def test_a_complete_job_with_other_settings_is_not_compared(
     run = SweepPaths(tmp_path).job(0)
     write_json(run.config, to_dict(compose("num_timesteps=100")))
     write_json(run.summary, {"status": "interrupted", "env_steps": 50})
-    wanted = compose("num_timesteps=100", *overrides)
-    assert state_of(run, wanted) == "waiting"
+    for steps in (100, 200):
+        wanted = compose(f"num_timesteps={steps}", *overrides)
+        require_same(run, wanted)
     write_json(run.summary, {"status": "completed", "env_steps": 100})
-    with pytest.raises(ConfigError, match=re.escape(f"complete with other settings: {change}")):
-        state_of(run, wanted)
-    own = compose("num_timesteps=100", "run.checkpoint_every=7", "plan.memory_fraction=0.3")
-    assert state_of(run, own) == "completed"
+    for steps in (100, 200):
+        wanted = compose(f"num_timesteps={steps}", *overrides)
+        refused = re.escape(f"complete with other settings: {change}")
+        with pytest.raises(ConfigError, match=refused):
+            require_same(run, wanted)
+    require_same(run, compose("run.checkpoint_every=7", "plan.memory_fraction=0.3"))
+
+
+def test_a_complete_job_of_distillation_has_the_checkpoint_of_its_teacher(tmp_path: Path) -> None:
+    run, config = SweepPaths(tmp_path).job(0), compose("algo=distill", "algo.teacher=runs/x")
+    saved = to_dict(config)
+    saved["algo"]["teacher"] = "/else/runs/x/checkpoints/000000000640"
+    write_json(run.config, saved)
+    write_json(run.summary, {"status": "completed", "env_steps": config.num_timesteps})
+    require_same(run, config)
+
+
+def test_a_complete_job_with_an_edited_task_is_not_compared(tmp_path: Path) -> None:
+    run, config = SweepPaths(tmp_path).job(0), compose()
+    env = dataclasses.replace(config.env, suite="custom", name="t.py:make", source_sha256="a")
+    config = dataclasses.replace(config, env=env)
+    write_json(run.config, to_dict(config))
+    write_json(run.summary, {"status": "completed", "env_steps": config.num_timesteps})
+    require_same(run, config)
+    edited = dataclasses.replace(config, env=dataclasses.replace(env, source_sha256="b"))
+    with pytest.raises(ConfigError, match="has changed since the run was started"):
+        require_same(run, edited)
 
 
 def shown_tables(folder: Path, jobs: Sequence[Job], sweep: SweepConfig) -> list[list[list[str]]]:
