@@ -33,10 +33,7 @@ from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.reduction import why_no_bindings, why_no_nccl
 from gmijax.runs.folder import RunPaths, read_json
 
-JOB = (
-    *("env=ant", "num_envs=8192", "num_timesteps=60e6"),
-    "run.max_restarts=0",
-)
+JOB = ("env=ant", "num_envs=8192", "num_timesteps=60e6", "run.max_restarts=0")
 LONGEST_S = 180.0
 """Of a run: nodes that cannot reach each other by NCCL wait for much longer."""
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmijax.config import EnvConfig, TrainConfig
-from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
 from gmijax.partition.plan import Plan
 from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of, newest_checkpoint
@@ -120,9 +119,7 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
         )
     require_known_keys(saved, shown)
     found = newest_checkpoint(folder)
-    # Keys that its version did not have are as they were without.
-    whole = saved | {"env": to_dict(env), "algo": to_dict(algo)}
-    changes = differences(whole, to_dict(config))
+    changes = differences(saved, config).values()
     notes = (*found.passed_over, *(f"changed since the run: {text}" for text in changes))
     if found.checkpoint is None:
         return StartPoint(run, notes=notes)

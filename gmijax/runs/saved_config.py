@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig, TrainConfig
 from gmijax.config.removed import REMOVED, without_removed
-from gmijax.config.schema import flatten, from_dict, from_named, known
+from gmijax.config.schema import flatten, from_dict, from_named, known, to_dict
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.resume import any_checkpoint
@@ -94,23 +94,26 @@ def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
         )
 
 
-def differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
-    """What a job that goes on in a run's folder does otherwise, a sentence for each key.
+def differences(saved: Mapping[str, Any], config: TrainConfig) -> dict[str, str]:
+    """What a job does otherwise than a run, a sentence by key.
 
     Args:
-      saved: the run's configuration.
+      saved: the run's configuration. Keys of task and algorithm that its version did not have are
+        as they were without.
       config: that of the job.
     """
+    env, algo = task_and_algorithm(saved)
+    whole = {**saved, "env": to_dict(env), "algo": to_dict(algo)}
     # As both are after a round trip through JSON.
-    before, now = (flatten(json.loads(json.dumps(one))) for one in (saved, config))
-    return [
-        f"{key} is {now.get(key)!r}, was {before.get(key)!r}"
+    before, now = (flatten(json.loads(json.dumps(one))) for one in (whole, to_dict(config)))
+    return {
+        key: f"{key} is {now.get(key)!r}, was {before.get(key)!r}"
         for key in dict.fromkeys((*now, *before))
         if now.get(key) != before.get(key)
         # What was decided in its place is no other wish.
         and key not in _OWN_KEYS
         and now.get(key) != "auto"
-    ]
+    }
 
 
 def left_out(checkpoint: Path) -> str | None:

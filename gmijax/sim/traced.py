@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 
 from gmijax.sim.interface import Env
 
-inlined: Callable[..., Callable[..., jax.Array]] = partial(jax.jit, inline=True)
+inlined: Callable[..., Callable[..., Any]] = partial(jax.jit, inline=True)
 """Keeps what it traced; a program that calls it has its operations, not a call."""
 
 

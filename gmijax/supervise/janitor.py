@@ -182,7 +182,7 @@ def _with_members(groups: _Groups) -> _Groups:
     for group, known in groups.items():
         running = {process for process in known if process.is_running()}
         members = set(members_of(group)) if running else set()
-        # A leader may end between the two looks; by then its group had its number.
+        # Where a leader has run, the number was its group's, even if it has ended since.
         if members & known or (members and any(one.pid == group for one in running)):
             left[group] = members
     return left

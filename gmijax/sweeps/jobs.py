@@ -6,21 +6,21 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 from gmijax.config import BackendName, TrainConfig
 from gmijax.config.schema import flatten, to_dict
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.names import nearby
-from gmijax.runs.saved_config import config_of_run, differences, task_and_algorithm
+from gmijax.runs.saved_config import config_of_run, differences
 from gmijax.sim import source
 from gmijax.sweeps.any_job import label_of
 from gmijax.sweeps.progress import Progress, State
 from gmijax.sweeps.slots import Slot
 
-_LEARNT_WITH = ("env.", "algo.", "physics.", "num_envs ", "seed ")
-"""Beginnings of the keys that decide what a job learns."""
+_LEARNT_WITH = ("env.", "algo.", "physics.", "num_envs", "seed")
+"""Groups and keys that decide what a job learns."""
 
 
 @dataclass(frozen=True)
@@ -132,28 +132,22 @@ def started_in(config: TrainConfig, run: RunPaths) -> TrainConfig:
 
 def state_of(run: RunPaths, config: TrainConfig) -> State:
     """Whether an earlier attempt at the sweep has completed a job."""
-    if not run.summary.exists():
-        return "waiting"
-    summary = read_json(run.summary)
-    steps = summary.get("env_steps")
+    steps = (_complete(run) or {}).get("env_steps")
     is_far = isinstance(steps, int | float) and steps >= config.num_timesteps
-    return "completed" if summary.get("status") == "completed" and is_far else "waiting"
+    return "completed" if is_far else "waiting"
 
 
 def require_same(run: RunPaths, config: TrainConfig) -> None:
     """Raises ConfigError if a job is complete with other settings: others are compared with it."""
-    if not (run.summary.exists() and run.config.exists()):
-        return
-    if read_json(run.summary).get("status") != "completed":
+    if _complete(run) is None or not run.config.exists():
         return
     saved = config_of_run(run)
-    env, algo = task_and_algorithm(saved)
-    # Keys that its version did not have are as they were without.
-    whole = saved | {"env": to_dict(env), "algo": to_dict(algo)}
-    changes = differences(whole, to_dict(config))
-    changed = [text for text in changes if text.startswith(_LEARNT_WITH)]
-    # In the run it is the checkpoint that was found for what the user gave.
-    changed = [text for text in changed if not text.startswith("algo.teacher ")]
+    changed = [
+        text
+        for key, text in differences(saved, config).items()
+        # In the run a teacher is the checkpoint that was found for what the user gave.
+        if key.startswith(_LEARNT_WITH) and key != "algo.teacher"
+    ]
     if edited := source.changes(config.env, saved["env"]):
         changed.append(edited)
     if changed:
@@ -161,3 +155,9 @@ def require_same(run: RunPaths, config: TrainConfig) -> None:
             f"{nearby(run.root)}: this job is complete with other settings: {changed[0]}; give "
             "those, or another folder"
         )
+
+
+def _complete(run: RunPaths) -> Mapping[str, Any] | None:
+    """The summary of a run that is complete, for however many steps; None: it is not."""
+    summary = read_json(run.summary) if run.summary.exists() else {}
+    return summary if summary.get("status") == "completed" else None

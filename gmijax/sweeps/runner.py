@@ -237,11 +237,11 @@ def _beginning(work: Work[J], paths: SweepPaths, console: Console) -> tuple[list
     """
     settings, wanted = work.settings, json.loads(json.dumps(work.identity()))
     if paths.request.exists() and (held := read_json(paths.request)) != wanted:
-        name = "pack" if "commands" in held else "sweep"
-        what = f"another {name}; give the same {work.resume_requirement}, or another folder"
+        if (name := "pack" if "commands" in held else "sweep") != work.name:
+            raise ConfigError(f"run.dir={paths.root}: holds a {name}; give another folder")
         raise ConfigError(
-            f"run.dir={paths.root}: holds "
-            + (what if name == work.name else f"a {name}; give another folder")
+            f"run.dir={paths.root}: holds another {name}; give the same "
+            f"{work.resume_requirement}, or another folder"
         )
     study = Study[J]()
     jobs = list(work.jobs)
