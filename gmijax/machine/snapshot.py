@@ -31,7 +31,7 @@ _HIDES_ALL = ("", "-1", "NoDevFiles")
 """Values of `CUDA_VISIBLE_DEVICES` that say on purpose that there are no GPUs."""
 
 DAEMONS_VARIABLE = "GMIJAX_MPS_DAEMONS"
-"""Tells a job of a sweep the daemons that the sweep has for it: JSON, see `Machine.daemons`."""
+"""Tells a job of a sweep or pack the daemons it has of that: JSON, see `Machine.daemons`."""
 
 _OTHERS = {"kfd": "a GPU for ROCm", "accel[0-9]*": "a TPU"}
 
@@ -47,7 +47,7 @@ class Machine:
       mps_control: program of the MPS daemon, None where it is not installed.
       driver_version: of the NVIDIA driver, None without one.
       operator_daemon: pipe directory of a running MPS daemon that somebody else started.
-      daemons: the same for a job of a sweep, by UUID of the GPU or MIG instance.
+      daemons: the same for a job of a sweep or pack, by UUID of the GPU or MIG instance.
       host: what is left of memory, threads and open files.
       gpu_problem: why there are no GPUs although NVIDIA's driver is there; None where it works,
         there is none, or the user hides all GPUs.
@@ -96,7 +96,7 @@ def detect_machine() -> Machine:
     An inherited `CUDA_VISIBLE_DEVICES` restricts the GPUs, as a batch system that sets it
     expects; GPUs keep their indices of nvidia-smi.
     """
-    selection = os.environ.get("CUDA_VISIBLE_DEVICES")
+    selection = _selection()
     cores = sorted(os.sched_getaffinity(0))
     listed = list_gpus()
     gpus = visible_gpus(listed, selection)
@@ -109,7 +109,7 @@ def detect_machine() -> Machine:
         mps_control=mps_control,
         driver_version=driver_version(),
         operator_daemon=daemon,
-        daemons=_daemons_of_sweep(mps_control) if mps_control else {},
+        daemons=_given_daemons(mps_control) if mps_control else {},
         host=detect_host(),
         gpu_problem=None if listed or is_hidden else gpu_problem(),
         selection_problem=_selection_problem(listed, selection),
@@ -141,6 +141,18 @@ def visible_gpus(gpus: tuple[Gpu, ...], selection: str | None) -> tuple[Gpu, ...
             break
         chosen[part.index] = part._replace(instances=(*before, *part.instances))
     return tuple(chosen.values())
+
+
+def _selection() -> str | None:
+    """`CUDA_VISIBLE_DEVICES`, by UUIDs for a job of a pack.
+
+    A daemon numbers the GPUs it has from 0, and its clients are given those numbers. They are not
+    those of nvidia-smi.
+    """
+    selection = os.environ.get("CUDA_VISIBLE_DEVICES")
+    daemons = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
+    are_numbers = selection is not None and all(map(str.isdecimal, _entries(selection)))
+    return ",".join(daemons) if daemons and are_numbers else selection
 
 
 def _selection_problem(gpus: tuple[Gpu, ...], selection: str | None) -> str | None:
@@ -194,7 +206,7 @@ def _operator_daemon(program: Path) -> tuple[Path | None, str | None]:
     return (directory if MpsControl(program, directory).is_answering() else None), None
 
 
-def _daemons_of_sweep(program: Path) -> dict[str, Path]:
+def _given_daemons(program: Path) -> dict[str, Path]:
     """Those of `DAEMONS_VARIABLE` that answer."""
     told = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
     found = {device: Path(directory) for device, directory in told.items()}

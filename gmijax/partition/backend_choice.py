@@ -43,7 +43,8 @@ def choose_backend(
     most = max(len(gmis) for gmis in layout.gmis_of_gpu)
     if why_mig := _why_mig(plan, layout, machine, serves):
         return "mig", why_mig
-    if most == 1 and plan.sm_percent is None:
+    has_neighbours = any(gpu.uuid in machine.daemons for gpu in candidates(plan, machine))
+    if most == 1 and plan.sm_percent is None and not has_neighbours:
         return "share", "one GMI on every GPU has nothing to share, and MPS would only add risk"
     oldest = min(gpu.compute_capability for gpu in candidates(plan, machine))
     if oldest[0] < _VOLTA:
@@ -55,8 +56,7 @@ def choose_backend(
         return "share", (
             f"warning: nvidia-cuda-mps-control is not installed, so {WHAT_SHARE_LOSES}"
         )
-    daemon = "the daemon that runs here" if machine.operator_daemon else "an own daemon"
-    why = f"up to {most} GMIs on a GPU run at the same time with {daemon}"
+    why = _why_mps(most, machine, has_neighbours=has_neighbours)
     if oldest[0] < _AMPERE:
         return "mps", f"{why}; compute capability {_version(oldest)} has no MIG"
     if serves and plan.sm_percent is not None:
@@ -64,6 +64,13 @@ def choose_backend(
     if serves:
         return "mps", f"{why}; there are no MIG instances to keep them apart"
     return "mps", f"{why}, and can exchange gradients"
+
+
+def _why_mps(most: int, machine: Machine, *, has_neighbours: bool) -> str:
+    if has_neighbours:
+        return "it runs at the same time as other jobs, with the daemon of their pack or sweep"
+    daemon = "the daemon that runs here" if machine.operator_daemon else "an own daemon"
+    return f"up to {most} GMIs on a GPU run at the same time with {daemon}"
 
 
 def require_backend(backend: BackendName, machine: Machine) -> None:

@@ -176,6 +176,9 @@ def client_variables(
     else:
         variables["CUDA_DEVICE_ORDER"] = "PCI_BUS_ID"
         variables["CUDA_VISIBLE_DEVICES"] = device if gpu is None else str(gpu.index)
+    if slot.backend == "mps":
+        # A job of ours in a pack knows its GPU by UUID, and that it is to be a client.
+        variables[DAEMONS_VARIABLE] = json.dumps({device: variables[PIPE_VARIABLE]})
     if slot.backend == "mps" and process.memory_fraction is not None and gpu is not None:
         variables[MEMORY_LIMIT_VARIABLE] = f"0={int(process.memory_fraction * gpu.memory_mib)}M"
     return variables

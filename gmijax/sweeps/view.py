@@ -24,6 +24,7 @@ _HEADINGS = (
 _STOPPING = "stopping: running jobs save and end; a second {} ends them at once, without saving"
 _MOST_ROWS = 30
 _BAR_WIDTH = 6
+_LONG_LABEL = 80
 _ORDER = ("running", "failed", "interrupted", "waiting", "pruned", "completed")
 
 
@@ -87,12 +88,15 @@ class SweepView:
                 self._console.print(self._change(job, job.progress))
 
     def _change(self, job: AnyJob, progress: Progress) -> str:
-        what = f"{' '.join(filter(None, ('job', str(job.number), job.label)))}: {progress.state}"
+        # What is long, as a command with its arguments, is there once: when the job starts.
+        is_named = progress.state == "running" or len(job.label) <= _LONG_LABEL
+        words = ("job", str(job.number), job.label if is_named else "")
+        what = f"{' '.join(filter(None, words))}: {progress.state}"
         if progress.state == "running":
             where = f" on {progress.slot}" if progress.slot else ""
             return f"{what}{where}{f' ({progress.note})' if progress.note else ''}"
-        if words := [word for word in (progress.error, progress.stage[2]) if word]:
-            return f"{what}: {'; '.join(words)}"
+        if reasons := [word for word in (progress.error, progress.stage[2]) if word]:
+            return f"{what}: {'; '.join(reasons)}"
         value = ""
         if progress.value is not None:
             found = shown(progress.value, progress.is_full, progress.episodes)

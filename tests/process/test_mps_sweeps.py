@@ -18,7 +18,8 @@ from gmijax.machine.snapshot import DAEMONS_VARIABLE, detect_machine
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.stop_signals import StopSignals
-from gmijax.sweeps.host import LocalHost, variables_of
+from gmijax.sweeps.children import Process
+from gmijax.sweeps.host import LocalHost, client_variables, variables_of
 from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.scheduler import Scheduler
@@ -59,6 +60,32 @@ def test_a_fatal_fault_ends_one_job_of_a_sweep_and_its_neighbours_go_on(
     # From their checkpoints, and nobody beside them: it could be the fault of each.
     assert {starts[n][1] for n in (1, 3, 5)} == {"from step 5 beside 0"}
     assert [job.progress.value for job in jobs] == [10.0, 5.0, 10.0, 10.0, 10.0, 10.0]
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_training_as_a_job_of_a_pack_is_a_client_on_the_gpu_of_its_slot(
+    number: int, mps: FakeMps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    here = machine(2, mps_control=mps.program)
+    plan = plan_slots(SweepConfig(jobs_per_gpu=2), here, {"auto"})
+    job = Process("job", ("true",), tmp_path / "log", is_client=True, memory_fraction=0.5)
+    monkeypatch.setattr("gmijax.machine.snapshot.list_gpus", lambda: here.gpus)
+    with open_backend(plan, here, SweepPaths(tmp_path / "sweep")) as backend:
+        pool = SlotPool([Site(plan, here)])
+        slot = next(
+            slot
+            for _ in range(4)
+            if (slot := pool.acquire(1)) and slot.devices == (gpu(number).uuid,)
+        )
+        for name, value in client_variables(slot, job, backend, here).items():
+            monkeypatch.setenv(name, value)
+        of_job = detect_machine()
+        assert [found.uuid for found in of_job.gpus] == [gpu(number).uuid]
+        with open_backend(planned(of_job), of_job, RunPaths(tmp_path / "run")) as own:
+            assert own.environment(0)[PIPE_VARIABLE] == str(backend.daemons[gpu(number).uuid])
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "-1")
+        assert not detect_machine().gpus
+    assert not mps.left()
 
 
 def test_a_job_with_several_gpus_uses_the_daemons_of_its_sweep(

@@ -78,6 +78,17 @@ def test_one_serving_gmi_takes_a_whole_gpu(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize(
+    ("neighbours", "backend"), [("GPU-0-uuid", "mps"), ("GPU-7-uuid", "share")]
+)
+def test_one_gmi_is_a_client_of_the_daemon_that_its_pack_has_for_the_gpu(
+    monkeypatch: pytest.MonkeyPatch, neighbours: str, backend: str
+):
+    here = machine_of(monkeypatch, H200_MIG_OFF, mps_control=MPS, daemons={neighbours: Path("/d")})
+    plan = make_plan(PlanConfig(), ReduceConfig(), 64, here)
+    assert plan.backend == backend
+
+
+@pytest.mark.parametrize(
     ("boards", "changes", "why"),
     [
         ((H200_MIG_EMPTY,), {}, "GPU 0 is in MIG mode, .* it has no instance"),

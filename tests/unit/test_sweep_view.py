@@ -125,6 +125,19 @@ def test_without_a_terminal_every_change_is_a_line() -> None:
     assert lines[3:] == ["job 0 seed=0: failed: GMI 0 failed: NonFiniteError"]
 
 
+def test_a_long_command_is_there_once() -> None:
+    said, jobs = io.StringIO(), running_jobs()[:2]
+    jobs[0].overrides["command"] = "python train.py --seed 7 " + "--more options " * 20
+    with view_on(said, jobs) as view:
+        view.update()
+        for job in jobs:
+            job.progress.state, job.progress.error = "failed", "exit code 3"
+    assert said.getvalue().count("--seed 7") == 1
+    assert said.getvalue().endswith(
+        "job 0: failed: exit code 3\njob 1 seed=1: failed: exit code 3\n"
+    )
+
+
 def test_a_value_of_a_window_that_is_not_full_is_marked_where_it_is_shown() -> None:
     said, (job,) = io.StringIO(), jobs_of([compose()])
     early = {"return": 9.0, "window/return": 8.0, "window/episodes": 12, "window/full": 0}
