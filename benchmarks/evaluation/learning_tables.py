@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from benchmarks.cases import REWARD, TASKS
@@ -184,14 +185,14 @@ def throughput() -> Rows:
                 yield [f"`{task}`", f"{envs:,}", *(shown(one, ",.0f") for one in found)]
 
 
-def _kind_of_walking(call: Call) -> tuple[str, str, str | None, bool]:
-    """Task or robot, algorithm of our trainings as it is written, GPU and start."""
+def _kind_of_walking(call: Call) -> tuple[str, str, str, str | None, bool]:
+    """Task or robot, algorithm of our trainings as it is written, physics, GPU and start."""
     assert call.settings is not None
     given = dict(word.split("=", 1) for word in call.settings["overrides"])
     algo = given.get("algo", "ppo").upper()
     task = call.results["task"]
     robot = robot_name(task.removeprefix("playground/"))
-    return robot or task, algo, call.device, call.settings["cold"]
+    return robot or task, algo, _physics(call, OURS), call.device, call.settings["cold"]
 
 
 @table_of_calls(
@@ -203,7 +204,7 @@ def _kind_of_walking(call: Call) -> tuple[str, str, str | None, bool]:
 )
 def walking(calls: Calls) -> Rows:
     """How long robots are trained until they walk: median, least and most of seeds."""
-    for (task, algo, _, is_cold), (call, _) in sorted(calls.items()):
+    for (task, algo, _, _, is_cold), (call, _) in sorted(calls.items()):
         start = "compiled anew" if is_cold else "from the cache"
         for trainer, row in call.results["rows"].items():
             name = trainer if trainer == SCRIPT else f"{trainer} {algo}"
@@ -228,17 +229,30 @@ def _tests_of(call: Call, trainer: str) -> list[list[Mapping[str, Any]]]:
     return [[one for one in checkpoints if "walk" in one] for checkpoints in runs]
 
 
-def seconds_until_it_walks(task: str) -> Figure | None:
+def seconds_until_it_walks(task: str, impl: str) -> Figure | None:
     """Seconds of training by SAC in the newest call, compiled before; None if one fails."""
+    call, path = _newest_of_sac(task, impl)
+    row = call.results["rows"][OURS]
+    if row["walk"] < row["seeds"]:
+        return None
+    low, median, high = row["training_s"]
+    return Figure(median, low, high, row["walk"], frozenset([source(path.stem, call)]))
+
+
+def seeds_that_walk(task: str, impl: str) -> str:
+    """By SAC in that call, as `3 of 5`."""
+    row = _newest_of_sac(task, impl)[0].results["rows"][OURS]
+    return f"{row['walk']} of {row['seeds']}"
+
+
+def _newest_of_sac(task: str, impl: str) -> tuple[Call, Path]:
     calls = newest("walking-*-nvidia-*.json", _kind_of_walking)
-    for (of, algo, _, is_cold), (call, path) in calls.items():
-        if (of, algo, is_cold) == (task, "SAC", False):
-            row = call.results["rows"][OURS]
-            if row["walk"] == row["seeds"]:
-                low, median, high = row["training_s"]
-                sources = frozenset([source(path.stem, call)])
-                return Figure(median, low, high, row["walk"], sources)
-    return None
+    wanted = (task, "SAC", impl, False)
+    return next(
+        found
+        for (of, algo, physics, _, is_cold), found in calls.items()
+        if (of, algo, physics, is_cold) == wanted
+    )
 
 
 def _last_tests(call: Call, trainer: str) -> Iterator[str]:

@@ -12,7 +12,11 @@ from benchmarks.evaluation import claims, learning_tables, seed_tables  # noqa: 
 from benchmarks.evaluation.async_tables import asynchronous_gains, beside_a_learner
 from benchmarks.evaluation.evidence import Ratio, Said
 from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, Figure, said, said_bounds
-from benchmarks.evaluation.learning_tables import seconds_to_mark, seconds_until_it_walks
+from benchmarks.evaluation.learning_tables import (
+    seconds_to_mark,
+    seconds_until_it_walks,
+    seeds_that_walk,
+)
 from benchmarks.evaluation.other_tables import seconds_to_recover
 from benchmarks.evaluation.pack_tables import CLEANRL, MJLAB, eight_packed
 from benchmarks.evaluation.peer_tables import over_brax
@@ -73,7 +77,8 @@ def front() -> Values:
     beside = [one for one in over_brax() if one.evidence.is_enough]
     return {
         "ant": said(_brief(seconds_to_mark("ant")), ".1f"),
-        "go1": said(_brief(seconds_until_it_walks("go1")), ".0f"),
+        "go1": said(_brief(seconds_until_it_walks("go1", "jax")), ".0f"),
+        "go1_in_warp": Said(seeds_that_walk("go1", "warp"), None),
         "eight": said(_brief(eight_at_once(KEYS_OF_SWEEPS[STEPS]))),
         "mjlab": {key: said(gain) for key, gain in eight_packed(MJLAB).items()},
         "cleanrl": {key: said(gain) for key, gain in eight_packed(CLEANRL).items()},

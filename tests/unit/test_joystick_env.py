@@ -12,6 +12,7 @@ from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from stand_in_models import make_stand_ins
@@ -23,6 +24,7 @@ from gmijax.player.deployment import deployment_of
 from gmijax.player.joystick import ROBOTS, Ground
 from gmijax.player.joystick_draws import Commands
 from gmijax.player.joystick_env import JoystickEnv
+from gmijax.player.joystick_model import joystick_model
 from gmijax.player.walking import Recording, measure
 
 pytestmark = pytest.mark.skipif(
@@ -134,6 +136,25 @@ def test_go1_at_rest_stands_and_a_limp_one_falls_though_the_task_goes_on(models)
     walk = measure(played(limp, 100), limp.robot, Ground(limp.model), limp.control_dt_s)
     assert (walk.upright, walk.not_done) == (0.0, 1.0)
     assert walk.falls["low"] == 1
+
+
+def test_a_foot_that_hits_rough_ground_does_not_sink_into_it(models):
+    make_stand_ins(models, "Go1JoystickRoughTerrain", "go1")
+    model = joystick_model(ROBOTS["go1"], "rough")
+    data, ground, rng = mujoco.MjData(model), Ground(model), np.random.default_rng(0)
+    feet = [model.geom(name).id for name in ("FR", "FL", "RR", "RL")]
+    deepest_m = 0.0
+    for _ in range(12):
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        data.qpos[:3] += *rng.uniform(-5, 5, 2), 1.0
+        data.qvel[0] = 2.0
+        for _ in range(250):
+            mujoco.mj_step(model, data)
+            x, y, z = data.geom_xpos[feet].T
+            depth_m = ground.height_m(np.stack([x, y], -1)) + model.geom_size[feet, 0] - z
+            deepest_m = max(deepest_m, depth_m.max())
+    # With the detector that lets them sink it is 0.08 m.
+    assert deepest_m < 0.06
 
 
 def test_bad_numbers_are_a_fall_and_no_new_start(models):

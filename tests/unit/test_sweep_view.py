@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import struct
 import sys
@@ -127,7 +128,8 @@ def test_without_a_terminal_every_change_is_a_line() -> None:
 
 def test_a_long_command_is_there_once() -> None:
     said, jobs = io.StringIO(), running_jobs()[:2]
-    jobs[0].overrides["command"] = "python train.py --seed 7 " + "--more options " * 20
+    command = "python train.py --seed 7 " + "--more options " * 20
+    jobs[0] = dataclasses.replace(jobs[0], overrides={"command": command})
     with view_on(said, jobs) as view:
         view.update()
         for job in jobs:
