@@ -103,6 +103,11 @@ FAMILIES: Final = (
         rf"^(?P<steps>\d+): (?:mean episode )?reward=(?P<metric>{_NUMBER})\s*$",
     ),
     _family(
+        "gmijax",
+        r"^\d+ %  (?P<steps>[\d,]+) steps(?:  (?P<rate>[\d,]+) steps/s)?"
+        rf"(?:  return (?P<metric>{_NUMBER}))?",
+    ),
+    _family(
         "skrl (tqdm)",
         r"\s(?P<steps>\d+)/(?P<total>\d+) \[[\d:]+<[\d:?]+,\s*(?:(?P<rate>[\d.]+)it/s)?",
         is_weak=True,

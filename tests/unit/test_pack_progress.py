@@ -35,6 +35,7 @@ SAMPLES = {
         "saving next best rewards:  [12.5]",
     ),
     "MuJoCo Playground's train_jax_ppo.py": ("6400: reward=12.500",),
+    "gmijax": ("32 %  6400 steps  98,269 steps/s  return 12.50  ETA 0:42",),
     "skrl (tqdm)": (" 32%|###       | 6400/20000 [00:01<00:02, 98269.00it/s]",),
 }
 
