@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -71,7 +71,7 @@ class ProcessId(NamedTuple):
 def identify(pid: int) -> ProcessId | None:
     """The running process with number `pid`, or None (also for a zombie)."""
     try:
-        process, state, _ = _parse(Path(f"/proc/{pid}/stat").read_bytes())
+        process, state, *_ = _parse(Path(f"/proc/{pid}/stat").read_bytes())
     except OSError:
         return None
     return None if state in _ENDED else process
@@ -85,13 +85,28 @@ def own_process() -> ProcessId:
 
 def members_of(group: int) -> tuple[ProcessId, ...]:
     """The running processes of a process group; no zombies."""
-    found = []
+    return tuple(process for process, its_group, _ in _running() if its_group == group)
+
+
+def started_by(group: int) -> tuple[ProcessId, ...]:
+    """The running processes of a process group, and what they have started, in groups of its own.
+
+    What a process that has ended had started is left out, unless it is of the group.
+    """
+    running = tuple(_running())
+    found = {process.pid: process for process, its_group, _ in running if its_group == group}
+    while more := [p for p, _, parent in running if parent in found and p.pid not in found]:
+        found |= {process.pid: process for process in more}
+    return tuple(found.values())
+
+
+def _running() -> Iterator[tuple[ProcessId, int, int]]:
+    """Every running process with its group and its parent."""
     for entry in Path("/proc").glob("[0-9]*"):
         with suppress(OSError, ValueError):  # It may end meanwhile.
-            process, state, its_group = _parse((entry / "stat").read_bytes())
-            if its_group == group and state not in _ENDED:
-                found.append(process)
-    return tuple(found)
+            process, state, group, parent = _parse((entry / "stat").read_bytes())
+            if state not in _ENDED:
+                yield process, group, parent
 
 
 def that_have_open(path: Path) -> dict[int, str]:
@@ -139,9 +154,10 @@ def has_ended(process: subprocess.Popen[Any], timeout_s: float) -> bool:
     return wait_for(wait, timeout_s)
 
 
-def _parse(stat: bytes) -> tuple[ProcessId, bytes, int]:
-    """The process that a line of /proc/<pid>/stat is about, its state and its group."""
+def _parse(stat: bytes) -> tuple[ProcessId, bytes, int, int]:
+    """The process that a line of /proc/<pid>/stat is about, its state, its group, its parent."""
     # The second field is the program's name in brackets, which may itself hold blanks and
     # brackets: count from the last one.
     fields = stat.rpartition(b")")[2].split()
-    return ProcessId(int(stat.partition(b" ")[0]), int(fields[19])), fields[0], int(fields[2])
+    process = ProcessId(int(stat.partition(b" ")[0]), int(fields[19]))
+    return process, fields[0], int(fields[2]), int(fields[1])

@@ -6,6 +6,7 @@ import json
 import os
 import platform
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -150,7 +151,7 @@ def _selection() -> str | None:
     those of nvidia-smi.
     """
     selection = os.environ.get("CUDA_VISIBLE_DEVICES")
-    daemons = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
+    daemons = _told_daemons()
     are_numbers = selection is not None and all(map(str.isdecimal, _entries(selection)))
     return ",".join(daemons) if daemons and are_numbers else selection
 
@@ -208,9 +209,17 @@ def _operator_daemon(program: Path) -> tuple[Path | None, str | None]:
 
 def _given_daemons(program: Path) -> dict[str, Path]:
     """Those of `DAEMONS_VARIABLE` that answer."""
-    told = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
-    found = {device: Path(directory) for device, directory in told.items()}
+    found = {device: Path(directory) for device, directory in _told_daemons().items()}
     return {key: path for key, path in found.items() if MpsControl(program, path).is_answering()}
+
+
+def _told_daemons() -> dict[str, str]:
+    """What `DAEMONS_VARIABLE` says; nothing if somebody else has written it."""
+    with suppress(ValueError):
+        told = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
+        if isinstance(told, dict):
+            return {str(device): str(directory) for device, directory in told.items()}
+    return {}
 
 
 def _left_out_of_gmis() -> str | None:

@@ -105,7 +105,7 @@ FAMILIES: Final = (
     _family(
         "gmijax",
         r"^\d+ %  (?P<steps>[\d,]+) steps(?:  (?P<rate>[\d,]+) steps/s)?"
-        rf"(?:  return (?P<metric>{_NUMBER}))?",
+        rf"(?:.*?  return (?P<metric>{_NUMBER}))?",
     ),
     _family(
         "skrl (tqdm)",

@@ -68,7 +68,7 @@ def choose_backend(
 
 def _why_mps(most: int, machine: Machine, *, has_neighbours: bool) -> str:
     if has_neighbours:
-        return "it runs at the same time as other jobs, with the daemon of their pack or sweep"
+        return "its pack or sweep has an MPS daemon for this GPU"
     daemon = "the daemon that runs here" if machine.operator_daemon else "an own daemon"
     return f"up to {most} GMIs on a GPU run at the same time with {daemon}"
 

@@ -57,7 +57,7 @@ class Process(NamedTuple):
       input_file: path and JSON content, written before the start.
       has_lifeline: whether its last argument is to be the number of a pipe that ends with this
         process, and may bring an `INTERRUPT_BYTE` before.
-      is_client: whether the process itself uses its GPU, and starts nothing that has a share.
+      is_client: whether it, or what it starts, uses the GPU of its slot without knowing of slots.
       memory_fraction: part of the GPU's memory that it may have then; None: not limited.
       stop_signal: asks it to save and end.
       lock: a file that is locked while the process or one that it has started runs.

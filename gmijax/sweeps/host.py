@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 
 from gmijax.machine.mps_control import MEMORY_LIMIT_VARIABLE, PIPE_VARIABLE
 from gmijax.machine.nvidia import GpuLoad, load_of
-from gmijax.machine.processes import members_of
+from gmijax.machine.processes import started_by
 from gmijax.machine.snapshot import DAEMONS_VARIABLE, Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.cache import cache_folder
@@ -111,7 +111,7 @@ class LocalHost:
         # Killing a client that is busy can harm its neighbours.
         is_killing = order == "kill" or (order == "close" and child in self._clients)
         if is_killing and self._backend is not None and child in self._clients:
-            for process in members_of(self._children[child].pid):
+            for process in started_by(self._children[child].pid):
                 self._backend.terminate(self._clients[child], process.pid)
         getattr(self._children[child], order)()
         if order == "close":
@@ -126,7 +126,7 @@ class LocalHost:
         if self._backend is None or child not in self._clients:
             return None
         return self._backend.why_no_client(
-            self._clients[child], [one.pid for one in members_of(self._children[child].pid)]
+            self._clients[child], [one.pid for one in started_by(self._children[child].pid)]
         )
 
     def load_of(self, device: str) -> GpuLoad | None:
@@ -176,9 +176,9 @@ def client_variables(
     else:
         variables["CUDA_DEVICE_ORDER"] = "PCI_BUS_ID"
         variables["CUDA_VISIBLE_DEVICES"] = device if gpu is None else str(gpu.index)
-    if slot.backend == "mps":
+    if pipe := backend.daemons.get(device):
         # A job of ours in a pack knows its GPU by UUID, and that it is to be a client.
-        variables[DAEMONS_VARIABLE] = json.dumps({device: variables[PIPE_VARIABLE]})
+        variables[DAEMONS_VARIABLE] = json.dumps({device: str(pipe)})
     if slot.backend == "mps" and process.memory_fraction is not None and gpu is not None:
         variables[MEMORY_LIMIT_VARIABLE] = f"0={int(process.memory_fraction * gpu.memory_mib)}M"
     return variables

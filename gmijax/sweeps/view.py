@@ -40,6 +40,7 @@ class SweepView:
     def __init__(self, console: Console, jobs: Sequence[AnyJob], ranking: Ranking) -> None:
         self._console, self._jobs, self._ranking = console, jobs, ranking
         self._stages: dict[int, tuple[str, int, str | None]] = {}
+        self._named: set[int] = set()
         self._left: defaultdict[int, TimeLeft] = defaultdict(TimeLeft)
         self._display = LiveDisplay(console)
         self._is_stopping = False
@@ -88,8 +89,9 @@ class SweepView:
                 self._console.print(self._change(job, job.progress))
 
     def _change(self, job: AnyJob, progress: Progress) -> str:
-        # What is long, as a command with its arguments, is there once: when the job starts.
-        is_named = progress.state == "running" or len(job.label) <= _LONG_LABEL
+        # What is long, as a command with its arguments, is there once.
+        is_named = job.number not in self._named or len(job.label) <= _LONG_LABEL
+        self._named.add(job.number)
         words = ("job", str(job.number), job.label if is_named else "")
         what = f"{' '.join(filter(None, words))}: {progress.state}"
         if progress.state == "running":

@@ -85,6 +85,10 @@ def test_a_training_as_a_job_of_a_pack_is_a_client_on_the_gpu_of_its_slot(
             assert own.environment(0)[PIPE_VARIABLE] == str(backend.daemons[gpu(number).uuid])
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "-1")
         assert not detect_machine().gpus
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+        for not_ours in ("", "nope", "[1]"):
+            monkeypatch.setenv(DAEMONS_VARIABLE, not_ours)
+            assert [found.uuid for found in detect_machine().gpus] == [gpu(0).uuid]
     assert not mps.left()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import signal
@@ -22,7 +23,7 @@ from gmijax.control.console import open_console
 from gmijax.errors import ConfigError
 from gmijax.machine.mps_control import MEMORY_LIMIT_VARIABLE, PIPE_VARIABLE
 from gmijax.machine.nvidia import GpuLoad, MigInstance
-from gmijax.machine.snapshot import Machine
+from gmijax.machine.snapshot import DAEMONS_VARIABLE, Machine
 from gmijax.packs import slot_limiter
 from gmijax.packs.command_job import CommandJob
 from gmijax.packs.command_kind import CommandKind, PackPaths
@@ -243,6 +244,10 @@ def test_a_client_of_the_own_daemon_gets_the_first_gpu_and_its_part_of_the_memor
     # Of the daemon's one GPU; programs that take numbers alone do not know its UUID.
     assert found["CUDA_VISIBLE_DEVICES"] == "0"
     assert found[MEMORY_LIMIT_VARIABLE] == f"0={GPU.gpus[0].memory_mib // 2}M"
+    # Also on a MIG instance, for trainings of ours.
+    of_instance = dataclasses.replace(slot, backend="mig")
+    for one in (found, client_variables(of_instance, process, Placed(Path("/pipe")), GPU)):
+        assert json.loads(one[DAEMONS_VARIABLE]) == {GPU.gpus[0].uuid: "/pipe"}
 
 
 def test_jobs_that_take_turns_get_the_index_of_their_gpu() -> None:
@@ -252,6 +257,7 @@ def test_jobs_that_take_turns_get_the_index_of_their_gpu() -> None:
     assert found["CUDA_VISIBLE_DEVICES"] == str(GPU.gpus[0].index)
     assert found["CUDA_DEVICE_ORDER"] == "PCI_BUS_ID"
     assert MEMORY_LIMIT_VARIABLE not in found
+    assert DAEMONS_VARIABLE not in found
 
 
 @pytest.fixture

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from gmijax.control.progress import ConsoleProgress
 from gmijax.errors import ConfigError
 from gmijax.packs.output import LONGEST_LINE, OutputReader
 from gmijax.packs.progress import ProgressReader, own_patterns
-from gmijax.packs.trainers import FAMILIES, Family
+from gmijax.packs.trainers import FAMILIES, Family, Report
 
 SAMPLES = {
     "rsl_rl, Isaac Lab, mjlab": (
@@ -35,7 +38,7 @@ SAMPLES = {
         "saving next best rewards:  [12.5]",
     ),
     "MuJoCo Playground's train_jax_ppo.py": ("6400: reward=12.500",),
-    "gmijax": ("32 %  6400 steps  98,269 steps/s  return 12.50  ETA 0:42",),
+    "gmijax": ("32 %  6400 steps  98,269 steps/s  return 12.50  ETA 0:42  [GMI 0 running]",),
     "skrl (tqdm)": (" 32%|###       | 6400/20000 [00:01<00:02, 98269.00it/s]",),
 }
 
@@ -74,6 +77,25 @@ def test_every_family_finds_itself_in_its_sample(family: Family, log: Path):
     assert lines[-1]["env_steps"] == 6400
     if family.name != "skrl (tqdm)":  # Prints no return.
         assert lines[-1]["metric"] == 12.5
+
+
+_ASYNC = {
+    **{"async/pps": 9e4, "async/ttop": 8e4, "async/staleness_mean": 1.5},
+    **{"channel/occupancy": 0.5, "channel/bytes_per_s": 1.2e8},
+}
+
+
+@pytest.mark.parametrize(
+    ("more", "rate"), [({"env_steps_per_s": 98269.0}, 98269.0), (_ASYNC, None)]
+)
+def test_what_gmijax_prints_is_read(more: dict[str, float], rate: float | None):
+    lines, said = [{"env_steps": 6400, "return": 12.5, **more}], io.StringIO()
+    console = Console(file=said, width=300)
+    with ConsoleProgress(console, lambda: [lines.pop()] if lines else [], 20_000) as progress:
+        progress.update([])
+    (family,) = (family for family in FAMILIES if family.name == "gmijax")
+    found = [report for line in said.getvalue().splitlines() if (report := family.read(line))]
+    assert found == [Report(steps=6400.0, rate=rate, metric=12.5)]
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)

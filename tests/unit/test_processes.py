@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 from pathlib import Path
 
 from gmijax.machine.processes import (
@@ -13,6 +14,7 @@ from gmijax.machine.processes import (
     identify,
     members_of,
     own_process,
+    started_by,
     that_have_open,
     wait_until_gone,
 )
@@ -68,6 +70,24 @@ def test_members_of_a_group_are_those_that_run():
         os.killpg(shell.pid, signal.SIGKILL)
         shell.communicate()
     assert wait_until_gone(members_of(shell.pid), timeout_s=10) == ()
+
+
+def test_what_a_group_has_started_is_found_in_groups_of_its_own():
+    inner = "import os, sys, time; os.setsid(); print(os.getpid(), flush=True); time.sleep(60)"
+    outer = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {inner!r}])"
+    process = subprocess.Popen(
+        [sys.executable, "-c", outer], start_new_session=True, stdout=subprocess.PIPE
+    )
+    try:
+        assert process.stdout is not None
+        child = int(process.stdout.readline())
+        assert [one.pid for one in members_of(process.pid)] == [process.pid]
+        assert {one.pid for one in started_by(process.pid)} == {process.pid, child}
+    finally:
+        for one in started_by(process.pid):
+            os.kill(one.pid, signal.SIGKILL)
+        process.communicate()
+    assert started_by(process.pid) == ()
 
 
 def test_who_has_a_file_open(tmp_path: Path):

@@ -135,6 +135,10 @@ def test_a_long_command_is_there_once() -> None:
         for job in jobs:
             job.progress.state, job.progress.error = "failed", "exit code 3"
     assert said.getvalue().count("--seed 7") == 1
+    not_started = io.StringIO()
+    with view_on(not_started, jobs):
+        pass
+    assert not_started.getvalue().count("--seed 7") == 1
     assert said.getvalue().endswith(
         "job 0: failed: exit code 3\njob 1 seed=1: failed: exit code 3\n"
     )
