@@ -26,7 +26,7 @@ from gmijax.packs.template import fill
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.sweeps.children import ChildStatus, Process
 from gmijax.sweeps.kind import JobStart
-from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.paths import ENV_PACK_DIR, SweepPaths
 from gmijax.sweeps.running import JobOutcome, Running
 from gmijax.sweeps.slots import Slot
 
@@ -152,7 +152,7 @@ class CommandKind:
             **defaults,
             # Lines come when they are printed: a rate can be read, and a hang be seen.
             "PYTHONUNBUFFERED": "1",
-            "GMIJAX_PACK_DIR": str(self._paths.root),
+            ENV_PACK_DIR: str(self._paths.root),
             "GMIJAX_JOB": values["job"],
             "GMIJAX_RUN_DIR": values["run_dir"],
             **given,

@@ -9,6 +9,9 @@ from gmijax.runs.folder import RunPaths
 DIGITS = 3
 """Of the number of a job in the names of its files; more jobs have more digits."""
 
+ENV_PACK_DIR = "GMIJAX_PACK_DIR"
+"""Tells a job of a pack the folder of that."""
+
 
 class SweepPaths(RunPaths):
     """Files of a sweep or a pack; each job has a run folder of its own in it.

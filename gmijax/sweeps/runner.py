@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import time
 from collections.abc import Iterator, Sequence
@@ -23,7 +24,7 @@ from gmijax.sweeps.events import JobEvents
 from gmijax.sweeps.folder import errors_of_files, opened_folder
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.nodes import Host, nodes_of
-from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.paths import ENV_PACK_DIR, SweepPaths
 from gmijax.sweeps.report import JobsReport
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.slots import Site, SlotPool
@@ -214,6 +215,7 @@ def _lease(
     """Holds the GPUs of all slots; waits for those that another sweep has.
 
     Raises:
+      ConfigError: this is a job of the pack that has them, and would wait for its own end.
       JobInterrupted: a signal came.
     """
     # In one order, so that two sweeps do not wait for each other.
@@ -221,6 +223,11 @@ def _lease(
         devices = {allocation.device for allocation in site.plan.allocations} - {"cpu"}
         announced = None
         while (other := host.lease(devices)) is not None:
+            if (pack := os.environ.get(ENV_PACK_DIR)) is not None:
+                raise ConfigError(
+                    f"gmijax {work.name}: cannot be a job of a pack, here of {pack}, which has "
+                    "the GPU already; allowed there: gmijax train"
+                )
             if other != announced:
                 console.print(f"another {work.name} has {other}: waiting until it ends")
             if signals.have_come:

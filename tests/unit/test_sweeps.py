@@ -36,7 +36,7 @@ from gmijax.sweeps.jobs import Job, jobs_of, placed, require_placeable, require_
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.objective import require_logged, why_not_comparable, with_objective
 from gmijax.sweeps.packs import most_together, require_packable
-from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.paths import ENV_PACK_DIR, SweepPaths
 from gmijax.sweeps.profile_jobs import profiled_job
 from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import JobsReport, spread, tables
@@ -630,6 +630,28 @@ def test_a_gpu_goes_to_one_sweep_at_a_time(
     first.close()
     assert second.lease(["GPU-2", "GPU-3"]) is None
     second.close()
+
+
+def test_a_pack_in_a_job_of_a_pack_does_not_wait_for_its_own_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv(ENV_PACK_DIR, "runs/outer")
+    here = machine(1)
+    monkeypatch.setattr(runner, "detect_machine", lambda: here)
+    outer = LocalHost(here)
+    assert outer.lease([here.gpus[0].uuid]) is None
+    inner = [
+        "pack.copies=1",
+        "pack.jobs_per_gpu=1",
+        "pack.backend=share",
+        f"run.dir={tmp_path}/in",
+    ]
+    with pytest.raises(
+        ConfigError, match=r"^gmijax pack: .* here of runs/outer, which has the GPU"
+    ):
+        runner.run_work(build_pack(inner, ["true"]))
+    outer.close()
 
 
 @pytest.mark.parametrize(
