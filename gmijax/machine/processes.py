@@ -89,9 +89,9 @@ def members_of(group: int) -> tuple[ProcessId, ...]:
 
 
 def started_by(group: int) -> tuple[ProcessId, ...]:
-    """The running processes of a process group, and what they have started, in groups of its own.
+    """The running processes of a process group and their descendants, also in other groups.
 
-    What a process that has ended had started is left out, unless it is of the group.
+    Children of a process that has ended are left out, unless they are in the group themselves.
     """
     running = tuple(_running())
     found = {process.pid: process for process, its_group, _ in running if its_group == group}

@@ -32,7 +32,7 @@ _HIDES_ALL = ("", "-1", "NoDevFiles")
 """Values of `CUDA_VISIBLE_DEVICES` that say on purpose that there are no GPUs."""
 
 DAEMONS_VARIABLE = "GMIJAX_MPS_DAEMONS"
-"""Tells a job of a sweep or pack the daemons it has of that: JSON, see `Machine.daemons`."""
+"""Tells a job which MPS daemons its sweep or pack runs for it: JSON, see `Machine.daemons`."""
 
 _OTHERS = {"kfd": "a GPU for ROCm", "accel[0-9]*": "a TPU"}
 
@@ -145,10 +145,9 @@ def visible_gpus(gpus: tuple[Gpu, ...], selection: str | None) -> tuple[Gpu, ...
 
 
 def _selection() -> str | None:
-    """`CUDA_VISIBLE_DEVICES`, by UUIDs for a job of a pack.
+    """`CUDA_VISIBLE_DEVICES`, with UUIDs in place of numbers in a job of a pack.
 
-    A daemon numbers the GPUs it has from 0, and its clients are given those numbers. They are not
-    those of nvidia-smi.
+    A daemon numbers its GPUs from 0 and its clients see those numbers, not those of nvidia-smi.
     """
     selection = os.environ.get("CUDA_VISIBLE_DEVICES")
     daemons = _told_daemons()
@@ -214,7 +213,7 @@ def _given_daemons(program: Path) -> dict[str, Path]:
 
 
 def _told_daemons() -> dict[str, str]:
-    """What `DAEMONS_VARIABLE` says; nothing if somebody else has written it."""
+    """What `DAEMONS_VARIABLE` says; nothing if it is not valid."""
     with suppress(ValueError):
         told = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
         if isinstance(told, dict):

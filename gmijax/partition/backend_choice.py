@@ -68,8 +68,8 @@ def choose_backend(
 
 def _why_mps(most: int, machine: Machine, *, has_neighbours: bool) -> str:
     if has_neighbours:
-        return "its pack or sweep has an MPS daemon for this GPU"
-    daemon = "the daemon that runs here" if machine.operator_daemon else "an own daemon"
+        return "the pack or sweep that this job belongs to has an MPS daemon for this GPU"
+    daemon = "the daemon that runs here" if machine.operator_daemon else "a daemon of its own"
     return f"up to {most} GMIs on a GPU run at the same time with {daemon}"
 
 

@@ -36,8 +36,8 @@ def joystick_model(robot: Robot, terrain: Literal["flat", "rough"]) -> Any:
     assets = {path.name: path.read_bytes() for path in files if path.is_file()}
     model = mujoco.MjModel.from_xml_string(scene.read_text(), assets=assets)
     if model.nhfield:
-        # With MuJoCo's own collision detector a small foot that hits a field of heights sinks into
-        # it and stays there (MuJoCo 3.17, github.com/google-deepmind/mujoco/issues/2883). With
-        # libccd it does not, and neither does it in MJX, where policies are trained.
+        # With MuJoCo's own collision detector a small foot that hits a height field sinks into it
+        # and stays there (MuJoCo 3.17, github.com/google-deepmind/mujoco/issues/2883). With
+        # libccd it does not, nor does it in MJX, where policies are trained.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     return model

@@ -177,7 +177,7 @@ def client_variables(
         variables["CUDA_DEVICE_ORDER"] = "PCI_BUS_ID"
         variables["CUDA_VISIBLE_DEVICES"] = device if gpu is None else str(gpu.index)
     if pipe := backend.daemons.get(device):
-        # A job of ours in a pack knows its GPU by UUID, and that it is to be a client.
+        # It tells gmijax in a job of a pack its GPU's UUID, and to be an MPS client.
         variables[DAEMONS_VARIABLE] = json.dumps({device: str(pipe)})
     if slot.backend == "mps" and process.memory_fraction is not None and gpu is not None:
         variables[MEMORY_LIMIT_VARIABLE] = f"0={int(process.memory_fraction * gpu.memory_mib)}M"

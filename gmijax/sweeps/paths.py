@@ -10,7 +10,7 @@ DIGITS = 3
 """Of the number of a job in the names of its files; more jobs have more digits."""
 
 ENV_PACK_DIR = "GMIJAX_PACK_DIR"
-"""Tells a job of a pack the folder of that."""
+"""Tells a job of a pack the pack's folder."""
 
 
 class SweepPaths(RunPaths):

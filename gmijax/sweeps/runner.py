@@ -225,8 +225,8 @@ def _lease(
         while (other := host.lease(devices)) is not None:
             if (pack := os.environ.get(ENV_PACK_DIR)) is not None:
                 raise ConfigError(
-                    f"gmijax {work.name}: cannot be a job of a pack, here of {pack}, which has "
-                    "the GPU already; allowed there: gmijax train"
+                    f"gmijax {work.name} cannot be a job of a pack: this one belongs to {pack}, "
+                    "which holds the GPU already; use gmijax train in it"
                 )
             if other != announced:
                 console.print(f"another {work.name} has {other}: waiting until it ends")

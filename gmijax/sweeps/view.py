@@ -89,7 +89,7 @@ class SweepView:
                 self._console.print(self._change(job, job.progress))
 
     def _change(self, job: AnyJob, progress: Progress) -> str:
-        # What is long, as a command with its arguments, is there once.
+        # A long label, such as a command with its arguments, is printed only once.
         is_named = job.number not in self._named or len(job.label) <= _LONG_LABEL
         self._named.add(job.number)
         words = ("job", str(job.number), job.label if is_named else "")

@@ -38,7 +38,7 @@ SERVE = {"template": "tcg"}
 @pytest.mark.parametrize(
     ("boards", "control", "make", "backend", "why"),
     [
-        ((H200_MIG_OFF,), MPS, {}, "mps", "with an own daemon, and can exchange gradients"),
+        ((H200_MIG_OFF,), MPS, {}, "mps", "with a daemon of its own, and can exchange gradients"),
         ((H200_MIG_OFF,), MPS, SERVE, "mps", "no MIG instances to keep them apart"),
         ((H200_MIG_OFF, A100_SEVEN), MPS, {}, "mps", "and can exchange gradients"),
         ((H200_MIG_OFF, A100_SEVEN), MPS, SERVE, "mig", "serving needs no exchange"),

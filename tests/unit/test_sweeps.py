@@ -648,7 +648,7 @@ def test_a_pack_in_a_job_of_a_pack_does_not_wait_for_its_own_end(
         f"run.dir={tmp_path}/in",
     ]
     with pytest.raises(
-        ConfigError, match=r"^gmijax pack: .* here of runs/outer, which has the GPU"
+        ConfigError, match=r"^gmijax pack cannot be .* belongs to runs/outer, which"
     ):
         runner.run_work(build_pack(inner, ["true"]))
     outer.close()
