@@ -97,7 +97,8 @@ def detect_machine() -> Machine:
     An inherited `CUDA_VISIBLE_DEVICES` restricts the GPUs, as a batch system that sets it
     expects; GPUs keep their indices of nvidia-smi.
     """
-    selection = _selection()
+    daemons = _given_daemons()
+    selection = _selection(daemons)
     cores = sorted(os.sched_getaffinity(0))
     listed = list_gpus()
     gpus = visible_gpus(listed, selection)
@@ -110,7 +111,7 @@ def detect_machine() -> Machine:
         mps_control=mps_control,
         driver_version=driver_version(),
         operator_daemon=daemon,
-        daemons=_given_daemons(mps_control) if mps_control else {},
+        daemons=_answering(mps_control, daemons) if mps_control else {},
         host=detect_host(),
         gpu_problem=None if listed or is_hidden else gpu_problem(),
         selection_problem=_selection_problem(listed, selection),
@@ -144,13 +145,12 @@ def visible_gpus(gpus: tuple[Gpu, ...], selection: str | None) -> tuple[Gpu, ...
     return tuple(chosen.values())
 
 
-def _selection() -> str | None:
+def _selection(daemons: Mapping[str, Path]) -> str | None:
     """`CUDA_VISIBLE_DEVICES`, with UUIDs in place of numbers in a job of a pack.
 
     A daemon numbers its GPUs from 0 and its clients see those numbers, not those of nvidia-smi.
     """
     selection = os.environ.get("CUDA_VISIBLE_DEVICES")
-    daemons = _told_daemons()
     are_numbers = selection is not None and all(map(str.isdecimal, _entries(selection)))
     return ",".join(daemons) if daemons and are_numbers else selection
 
@@ -206,19 +206,21 @@ def _operator_daemon(program: Path) -> tuple[Path | None, str | None]:
     return (directory if MpsControl(program, directory).is_answering() else None), None
 
 
-def _given_daemons(program: Path) -> dict[str, Path]:
-    """Those of `DAEMONS_VARIABLE` that answer."""
-    found = {device: Path(directory) for device, directory in _told_daemons().items()}
-    return {key: path for key, path in found.items() if MpsControl(program, path).is_answering()}
-
-
-def _told_daemons() -> dict[str, str]:
+def _given_daemons() -> dict[str, Path]:
     """What `DAEMONS_VARIABLE` says; nothing if it is not valid."""
     with suppress(ValueError):
-        told = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
-        if isinstance(told, dict):
-            return {str(device): str(directory) for device, directory in told.items()}
+        given = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
+        if isinstance(given, dict):
+            return {str(device): Path(str(pipe)) for device, pipe in given.items()}
     return {}
+
+
+def _answering(program: Path, daemons: Mapping[str, Path]) -> dict[str, Path]:
+    return {
+        device: pipe
+        for device, pipe in daemons.items()
+        if MpsControl(program, pipe).is_answering()
+    }
 
 
 def _left_out_of_gmis() -> str | None:
