@@ -18,6 +18,9 @@ from gmijax.types import PyTree
 
 T = TypeVar("T")
 
+_LEARNING, _KEPT = "live.", "params."
+"""Of SAC, the policy that learns and its average: one and the same in older checkpoints."""
+
 
 def save(folder: Path, tree: PyTree) -> None:
     """Writes a tree of arrays; random keys as plain numbers.
@@ -51,7 +54,12 @@ def restore(folder: Path, template: T) -> T:
             raise
         why = lines_of(error)[0]
         raise ConfigError(f"checkpoint {folder} does not fit this job: {why}") from error
-    if why := _difference(_shapes(saved), _shapes(jax.eval_shape(_storable, template))):
+    wanted = _shapes(jax.eval_shape(_storable, template))
+    for name in wanted.keys() - saved.keys():
+        once = name.replace(_LEARNING, _KEPT, 1)
+        if name.startswith(_LEARNING) and once in saved:
+            saved[name] = saved[once]
+    if why := _difference(_shapes(saved), wanted):
         raise ConfigError(f"checkpoint {folder} does not fit this job: {why}")
     return jax.tree.map_with_path(lambda path, like: _restored(like, saved[_name(path)]), template)
 

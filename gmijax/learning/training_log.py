@@ -9,9 +9,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto import event_pb2, summary_pb2
-
 from gmijax.learning.episode_window import EpisodeWindow, Standing
 from gmijax.learning.physics_health import (
     OverflowCount,
@@ -21,6 +18,7 @@ from gmijax.learning.physics_health import (
 )
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.history import read_metrics, scalars
+from gmijax.runs.tensorboard import Event, EventsWriter, Summary
 
 Line: TypeAlias = Mapping[str, float | int | None]
 
@@ -50,19 +48,13 @@ class TensorBoardSink:
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._writer = EventsWriter(str(folder / "events"))
-        # Made by protobuf at run time: type checkers cannot see them.
-        self._event: Any = vars(event_pb2)["Event"]
-        self._summary: Any = vars(summary_pb2)["Summary"]
 
     def write(self, line: Line) -> None:
         """Takes one iteration's metrics; `env_steps` is the x axis."""
         steps = int(line["env_steps"] or 0)
-        values = [
-            self._summary.Value(tag=name, simple_value=value)
-            for name, value in scalars(line).items()
-        ]
-        summary = self._summary(value=values)
-        self._writer.write_event(self._event(wall_time=time.time(), step=steps, summary=summary))
+        values = [Summary.Value(tag=name, simple_value=x) for name, x in scalars(line).items()]
+        summary = Summary(value=values)
+        self._writer.write_event(Event(wall_time=time.time(), step=steps, summary=summary))
         self._writer.flush()
 
     def close(self) -> None:

@@ -54,9 +54,9 @@ class EventReader:
 
     def _of_file(self, path: Path) -> Iterator[Report]:
         from google.protobuf.message import DecodeError  # Takes a moment; most packs need none.
-        from tensorboardX.proto import event_pb2
 
-        kind: Any = vars(event_pb2)["Event"]  # Made by protobuf: type checkers cannot see it.
+        from gmijax.runs.tensorboard import Event
+
         try:
             with path.open("rb") as file:
                 file.seek(self._offsets[path])
@@ -67,7 +67,7 @@ class EventReader:
         while (data := _record(found, at)) is not None:
             at += _LENGTH.size + len(data) + 2 * _CHECK
             with suppress(DecodeError):
-                yield from self._values(kind.FromString(data))
+                yield from self._values(Event.FromString(data))
         self._offsets[path] += at
 
     def _values(self, event: Any) -> Iterator[Report]:

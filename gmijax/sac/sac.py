@@ -126,7 +126,7 @@ def step_into_replay(
     env: BatchedEnv, learner: SacLearner, model: PyTree, state: SacState, memory: Memory
 ) -> tuple[Memory, RolloutSums]:
     """A step of this GMI's environments, into its replay."""
-    weights = acting_weights(learner, state)
+    weights = acting_weights(learner, state)._replace(params=state.live)
 
     def keep(before: BatchState, drawn: Any, action: Array, out: StepOutput) -> Any:
         del drawn
@@ -159,5 +159,7 @@ SAC = Algorithm(
     envs=lambda memory: memory.envs,
     replay=lambda learner, memory: memory.replay if learner.config.save_replay else None,
     with_replay=lambda memory, replay: memory._replace(replay=replay),
-    learned=lambda state: (state.params, state.critics, state.targets, state.log_temperature),
+    learned=lambda state: (
+        *(state.params, state.live, state.critics, state.targets, state.log_temperature),
+    ),
 )

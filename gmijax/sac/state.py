@@ -29,12 +29,14 @@ class SacState(NamedTuple):
     """All that learning must remember; equal, bit by bit, on every GMI.
 
     Attributes:
-      params: weights of the policy; `value` is empty.
+      params: weights of the policy that is kept, played and exported: an average over its latest
+        updates, which `live` goes up and down around; `value` is empty.
       opt_states: of critics, policy and temperature.
       obs_moments: statistics of all observations before this iteration.
       learning_rate: [] float32.
       iteration: [] int32, finished iterations.
       key: base of the keys of updates; never consumed, only folded with iteration and rank.
+      live: weights of the policy that learns and explores.
       critics: weights of both critics, [2, ...].
       targets: slow copies of them.
       log_temperature: [] of the weight of the entropy.
@@ -48,6 +50,7 @@ class SacState(NamedTuple):
     learning_rate: Array
     iteration: Array
     key: PRNGKey
+    live: ActorCriticParams
     critics: PyTree
     targets: PyTree
     log_temperature: Array
@@ -81,6 +84,7 @@ def init(learner: SacLearner, obs_size: int, key: PRNGKey) -> SacState:
         learning_rate=jnp.asarray(config.learning_rate, jnp.float32),
         iteration=jnp.zeros((), jnp.int32),
         key=shuffle_key,
+        live=jax.tree.map(jnp.copy, params),
         critics=critics,
         targets=jax.tree.map(jnp.copy, critics),
         log_temperature=log_temperature,

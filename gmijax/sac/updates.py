@@ -28,6 +28,9 @@ from gmijax.sac.replay import Replay, Transitions, sample, sample_obs
 from gmijax.sac.state import SacLearner, SacState, optimizers
 from gmijax.types import Array, PRNGKey, PyTree
 
+_AVERAGE_RATE = 0.005
+"""Of the average of the policy in an update: it is over about the last 200."""
+
 _ENTROPY_OF_UNIT_STD = 0.5 * math.log(2.0 * math.pi * math.e)
 
 
@@ -95,7 +98,7 @@ def update_critics(
     state = state._replace(
         opt_states=(of_critics, of_policy, of_temperature),
         critics=critics,
-        targets=jax.tree.map(lambda slow, new: slow + rate * (new - slow), state.targets, critics),
+        targets=_nearer(state.targets, critics, rate),
         log_temperature=log_temperature,
         updates=state.updates + 1,
     )
@@ -110,16 +113,24 @@ def update_policy(
     config = learner.config
     raw = sample_obs(replay, batch_key, config.batch_size)
     own = jax.value_and_grad(policy_loss)(
-        *(state.params, learner, critics_of(config), state.critics),
+        *(state.live, learner, critics_of(config), state.critics),
         *(normalize(acting_moments(config, state), raw), jnp.exp(state.log_temperature)),
         action_key,
     )
     loss, grads = collectives.mean(own)
     of_critics, of_policy, of_temperature = state.opt_states
     _, optimizer, _ = optimizers(config)
-    params, of_policy = _step(optimizer, state, of_policy, grads, state.params)
-    opt_states = of_critics, of_policy, of_temperature
-    return state._replace(params=params, opt_states=opt_states), loss
+    live, of_policy = _step(optimizer, state, of_policy, grads, state.live)
+    state = state._replace(
+        params=_nearer(state.params, live, _AVERAGE_RATE),
+        live=live,
+        opt_states=(of_critics, of_policy, of_temperature),
+    )
+    return state, loss
+
+
+def _nearer(slow: PyTree, new: PyTree, rate: float) -> PyTree:
+    return jax.tree.map(lambda before, now: before + rate * (now - before), slow, new)
 
 
 def _batch(learner: SacLearner, state: SacState, replay: Replay, key: PRNGKey) -> Transitions:
@@ -139,7 +150,7 @@ def _gradients(
 ) -> tuple[tuple[PyTree, Array], CriticFigures]:
     """Of critics and temperature; and figures."""
     critics, temperature = critics_of(learner.config), jnp.exp(state.log_temperature)
-    next_action, next_log_prob = sampled_action(learner, state.params, batch.next_obs, key)
+    next_action, next_log_prob = sampled_action(learner, state.live, batch.next_obs, key)
     wanted = target_probs(critics, state.targets, batch, next_action, next_log_prob, temperature)
     (loss, at_ends), critic_grads = jax.value_and_grad(critic_loss, has_aux=True)(
         state.critics, critics, batch, wanted

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 from gmijax.runs.folder import RunPaths
 from gmijax.sweeps.jobs import Job
@@ -24,17 +23,14 @@ def write_hparams(job: Job, run: RunPaths, objective: str) -> None:
     if value is None or not job.overrides:
         return
     # Imported here: it costs a tenth of a second that no other use of this module should pay.
-    from tensorboardX.event_file_writer import EventsWriter
-    from tensorboardX.proto import event_pb2
-    from tensorboardX.summary import hparams, scalar
+    from gmijax.runs.tensorboard import Event, EventsWriter, hparams, scalar
 
-    event: Any = vars(event_pb2)["Event"]  # Made by protobuf at run time.
     tag = f"hparam/{objective}{'' if job.progress.is_full else '_window_not_full'}"
     chosen = {key: _value(text) for key, text in job.overrides.items()}
     run.tensorboard.mkdir(exist_ok=True)
     writer = EventsWriter(str(run.tensorboard / "events"), _SUFFIX)
     for summary in (*hparams(chosen, {tag: value}), scalar(tag, value)):
-        writer.write_event(event(wall_time=time.time(), step=steps, summary=summary))
+        writer.write_event(Event(wall_time=time.time(), step=steps, summary=summary))
     writer.close()
 
 

@@ -46,7 +46,7 @@ from gmijax.sac.replay import (
     sample,
     sample_obs,
 )
-from gmijax.sac.sac import SAC
+from gmijax.sac.sac import SAC, step_into_replay
 from gmijax.sac.updates import target_entropy
 from gmijax.sim.interface import EnvSpec
 
@@ -336,14 +336,35 @@ def test_each_part_learns_when_it_is_its_turn() -> None:
     for number, (before, after, metrics) in enumerate(run_of(learner, 4), start=1):
         # Of four rows, a critic learns in the last; the policy after every second.
         assert int(after.updates) == max(0, 2 * number - 3)
-        for name in ("critics", "params"):
+        for name in ("critics", "live"):
             old, new = (jax.tree.leaves(getattr(state, name)) for state in (before, after))
             assert any((a != b).any() for a, b in zip(old, new, strict=True)) == (number > 1)
         assert (float(metrics.losses.critic_loss) > 0) == (number > 1)
         # With this rate targets are what the critics have become.
         if number > 1:
             chex.assert_trees_all_close(after.targets, after.critics, rtol=1e-6, atol=1e-7)
+        # The policy that is kept has come a little nearer to the one that learns.
+        nearer = jax.tree.map(
+            lambda old, new: old + 0.005 * (new - old), before.params, after.live
+        )
+        chex.assert_trees_all_close(after.params, nearer, rtol=1e-5, atol=1e-7)
         assert float(after.obs_moments.count) == 32 * number  # Each observation counts once.
+
+
+def test_experience_is_made_by_the_policy_that_learns() -> None:
+    learner = learner_of()
+    state = jax.jit(partial(SAC.init, learner, 2))(jax.random.key(0))
+    envs = begin_episodes(ENV, jax.random.key(1), 0, 16, kept_steps=64)
+    memory = SAC.begin(learner, ENV, envs)
+    step = jax.jit(partial(step_into_replay, ENV, learner, ENV.model))
+    other = jax.tree.map(lambda leaf: leaf + 1.0, state.params)
+    expected, kept, learning = (
+        step(one, memory)[0].replay
+        for one in (state, state._replace(params=other), state._replace(live=other))
+    )
+    chex.assert_trees_all_equal(kept, expected)
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_close(learning, expected)
 
 
 @pytest.mark.parametrize(("updates", "every", "policy"), [(2, 4, 2), (4, 2, 8)])
