@@ -79,7 +79,9 @@ class Benchmark:
         count = max(1, min(self._given.gpus, len(self._machine.gpus), self._given.seeds))
         if not self._given.cold:
             for trainer in trainers:
-                self._train(trainer, "compile", Part(), is_short=True)
+                short = self._train(trainer, "compile", Part(), is_short=True)
+                if trainer == SCRIPT and not short["checkpoints"]:
+                    raise ConfigError("--script: a short training left no checkpoint, see above")
 
         def seeds_of(number: int, part: Part) -> None:
             self._seeds(str(number), trainers, range(number, self._given.seeds, count), part)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from benchmarks.cases import REWARD, TASKS
 from benchmarks.evaluation.evidence import Ratio, source
 from benchmarks.evaluation.figures import (
-    NOT_MEASURED,
     RATES,
     Figure,
     bounds,
@@ -232,29 +230,14 @@ def _tests_of(call: Call, trainer: str) -> list[list[Mapping[str, Any]]]:
 
 def seconds_until_it_walks(task: str, impl: str) -> Figure | None:
     """Seconds of training by SAC in the newest call, compiled before; None if one fails."""
-    if (found := _newest_of_sac(task, impl)) is None:
-        return None
-    call, path = found
-    row = call.results["rows"][OURS]
-    if row["walk"] < row["seeds"]:
-        return None
-    low, median, high = row["training_s"]
-    return Figure(median, low, high, row["walk"], frozenset([source(path.stem, call)]))
-
-
-def seeds_that_walk(task: str, impl: str) -> str:
-    """By SAC in that call, as `3 of 5`."""
-    if (found := _newest_of_sac(task, impl)) is None:
-        return NOT_MEASURED
-    row = found[0].results["rows"][OURS]
-    return f"{row['walk']} of {row['seeds']}"
-
-
-def _newest_of_sac(task: str, impl: str) -> tuple[Call, Path] | None:
     wanted = (task, "SAC", impl, False)
     calls = newest("walking-*-nvidia-*.json", _kind_of_walking)
-    kinds = (kind for kind in calls if (*kind[:3], kind[4]) == wanted)
-    return next((calls[kind] for kind in kinds), None)
+    found = next((calls[kind] for kind in calls if (*kind[:3], kind[4]) == wanted), None)
+    if found is None or (row := found[0].results["rows"][OURS])["walk"] < row["seeds"]:
+        return None
+    call, path = found
+    low, median, high = row["training_s"]
+    return Figure(median, low, high, row["walk"], frozenset([source(path.stem, call)]))
 
 
 def _last_tests(call: Call, trainer: str) -> Iterator[str]:

@@ -15,7 +15,6 @@ from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, Figure, said, sai
 from benchmarks.evaluation.learning_tables import (
     seconds_to_mark,
     seconds_until_it_walks,
-    seeds_that_walk,
 )
 from benchmarks.evaluation.other_tables import seconds_to_recover
 from benchmarks.evaluation.pack_tables import CLEANRL, MJLAB, eight_packed
@@ -77,8 +76,7 @@ def front() -> Values:
     beside = [one for one in over_brax() if one.evidence.is_enough]
     return {
         "ant": said(_brief(seconds_to_mark("ant")), ".1f"),
-        "go1": said(_brief(seconds_until_it_walks("go1", "jax")), ".0f"),
-        "go1_in_warp": Said(seeds_that_walk("go1", "warp"), None),
+        "go1": said(_brief(seconds_until_it_walks("go1", "warp")), ".0f"),
         "eight": said(_brief(eight_at_once(KEYS_OF_SWEEPS[STEPS]))),
         "mjlab": {key: said(gain) for key, gain in eight_packed(MJLAB).items()},
         "cleanrl": {key: said(gain) for key, gain in eight_packed(CLEANRL).items()},

@@ -75,6 +75,16 @@ def test_script_seeds_are_some_of_the_seeds(count, more, tmp_path, monkeypatch):
         walking.main()
 
 
+def test_a_script_that_cannot_train_ends_the_call_before_any_seed(tmp_path, monkeypatch):
+    ran = []
+    monkeypatch.setattr(walking, "run_command", lambda command, *_: ran.append(command) or 1)
+    given = ("env=go1", "num_envs=64", "--script=", f"--runs={tmp_path}", f"--out={tmp_path}")
+    monkeypatch.setattr("sys.argv", ["walking", *given])
+    with pytest.raises(ConfigError, match=r"^--script: a short training left no checkpoint"):
+        walking.main()
+    assert len(ran) == 2
+
+
 def test_every_seed_is_trained_and_tested_on_a_gpu_of_its_own(tmp_path, monkeypatch):
     gpus = tuple(Gpu(n, f"GPU-{n}", "some GPU", 80000, (9, 0), False) for n in (0, 1))
     for user in (walking, records):
@@ -133,11 +143,15 @@ def test_summary_has_least_median_and_most_of_those_that_walk():
     assert row["train-jax-ppo"]["command_s"] is None
 
 
+def by_script(folder, *all_steps):
+    for steps in all_steps:
+        at = folder / "Go1-now" / "checkpoints" / f"{steps:012d}"
+        at.mkdir(parents=True)
+        (at / "ppo_network_config.json").write_text("{}")
+
+
 def test_checkpoints_of_playgrounds_script_are_found_by_their_steps(tmp_path):
-    for steps in (2000, 1000):
-        folder = tmp_path / "Go1-now" / "checkpoints" / f"{steps:012d}"
-        folder.mkdir(parents=True)
-        (folder / "ppo_network_config.json").write_text("{}")
+    by_script(tmp_path, 2000, 1000)
     assert [one["env_steps"] for one in _theirs(tmp_path, 0.0)] == [1000, 2000]
 
 
@@ -313,11 +327,11 @@ def test_one_program_tests_all_checkpoints_of_a_kind(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("works", "script_seeds", "by_script"),
+    ("works", "script_seeds", "seeds"),
     [(True, (), [0, 1]), (False, (), [0, 1]), (True, ("--script-seeds=1",), [0])],
 )
 def test_a_call_trains_tests_and_writes_what_it_found(
-    works, script_seeds, by_script, tmp_path, monkeypatch
+    works, script_seeds, seeds, tmp_path, monkeypatch
 ):
     commands = []
 
@@ -338,6 +352,9 @@ def test_a_call_trains_tests_and_writes_what_it_found(
                 walks = [run[:2] for run in walks]
             write_json(Path(command[-1]), {"walks": walks})
             return 0 if works else 1
+        else:
+            (folder,) = (one for one in command if one.startswith("--logdir="))
+            by_script(Path(folder.removeprefix("--logdir=")), 100)
         return 0
 
     monkeypatch.setattr(walking, "run_command", run)
@@ -355,7 +372,7 @@ def test_a_call_trains_tests_and_writes_what_it_found(
     every = [one for one in ours[1] if one.startswith("run.checkpoint_every=")]
     assert gmijax.compose(*ours[1][3:]).run.checkpoint_every == int(every[0].split("=")[1]) > 1
     theirs = [command for command, _ in commands if "--impl=jax" in command]
-    assert [command[-1] for command in theirs[1:]] == [f"--seed={seed}" for seed in by_script]
+    assert [command[-1] for command in theirs[1:]] == [f"--seed={seed}" for seed in seeds]
     assert {"--env_name=Go1JoystickFlatTerrain", "--num_evals=5"} <= set(theirs[1])
     # How long a part is is compiled in.
     assert theirs[0][-2:] == ["--num_timesteps=50000000", "--num_evals=2"]
