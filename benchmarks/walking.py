@@ -112,7 +112,7 @@ class Benchmark:
         except FileExistsError:
             raise ConfigError(f"--runs={self._given.runs}: has a {folder.name} already") from None
         cache = folder if self._given.cold else self._scratch
-        variables = {**part.variables, "JAX_COMPILATION_CACHE_DIR": str(cache / "xla")}
+        variables = {**part.variables, **_caches(cache)}
         if trainer == OURS:
             command = self._our_command(folder, name, is_short=is_short)
         else:
@@ -171,8 +171,8 @@ class Benchmark:
         write_json(asked, config)
         module = [sys.executable, "-m", "benchmarks.walking_tests"]
         command = [*part.prefix, *module, str(asked), str(out)]
-        cache = {"JAX_COMPILATION_CACHE_DIR": str(self._scratch / "xla")}
-        code = run_command(command, self._deadline_s, {**part.variables, **cache})
+        variables = {**part.variables, **_caches(self._scratch)}
+        code = run_command(command, self._deadline_s, variables)
         self._codes_of_tests.append(code)
         found = read_json(out)["walks"] if out.exists() else [[] for _ in mine]
         for run, walks in zip(mine, found, strict=True):
@@ -265,6 +265,12 @@ def _theirs(folder: Path, started_s: float) -> list[dict[str, Any]]:
         }
         for path in found
     ]
+
+
+def _caches(folder: Path) -> dict[str, str]:
+    """Where programs and kernels of MJX-Warp are kept: in this folder."""
+    of = {"JAX_COMPILATION_CACHE_DIR": "xla", "WARP_CACHE_PATH": "warp"}
+    return {name: str(folder / kept) for name, kept in of.items()}
 
 
 def main() -> int:

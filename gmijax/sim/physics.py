@@ -33,6 +33,7 @@ from gmijax.sim.unsimulated import (
     refuse_parts,
 )
 from gmijax.sim.warp.batch import OVERFLOW, STATE, name_of
+from gmijax.sim.warp.kernels import compile_kernels
 from gmijax.sim.warp.step import WarpStep, moving
 from gmijax.types import Array, PRNGKey, PyTree
 
@@ -199,6 +200,7 @@ def from_mj_model(
     refuse_parts(mj_model, chosen)
     with _refusing(mj_model, chosen):
         if chosen == "warp":
+            compile_kernels()
             warp = WarpStep.load(mj_model, substeps, warp_sizes)
             model = kinematic_model(mj_model)
             if warp_sizes is None and warp.bounds is not None:

@@ -85,6 +85,20 @@ def test_a_script_that_cannot_train_ends_the_call_before_any_seed(tmp_path, monk
     assert len(ran) == 2
 
 
+@pytest.mark.parametrize("is_cold", [True, False])
+def test_a_cold_training_has_neither_programs_nor_kernels(is_cold, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(walking, "run_command", lambda *given: seen.append(given[2]) or 1)
+    more = ("--cold",) if is_cold else ()
+    given = ("env=go1", "num_envs=64", "--seeds=2", f"--runs={tmp_path}", f"--out={tmp_path}")
+    monkeypatch.setattr("sys.argv", ["walking", *given, *more])
+    walking.main()
+    *trainings, tests = seen
+    for name in ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH"):
+        assert len({variables[name] for variables in trainings}) == (2 if is_cold else 1)
+        assert Path(tests[name]).parent == tmp_path
+
+
 def test_every_seed_is_trained_and_tested_on_a_gpu_of_its_own(tmp_path, monkeypatch):
     gpus = tuple(Gpu(n, f"GPU-{n}", "some GPU", 80000, (9, 0), False) for n in (0, 1))
     for user in (walking, records):

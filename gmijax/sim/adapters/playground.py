@@ -25,6 +25,7 @@ from gmijax.sim.physics import which_overflowed
 from gmijax.sim.robot_models import has_randomizer
 from gmijax.sim.robots import BUFFERS, ROBOT_SETTINGS, playground_name
 from gmijax.sim.tasks.settings import settings_from
+from gmijax.sim.warp.kernels import compile_kernels
 from gmijax.types import Array, PRNGKey, PyTree
 
 REWARDS = "reward_config.scales."
@@ -63,6 +64,8 @@ def make(
     if "impl" in config:
         changed["impl"], _ = choose_impl(impl, jax.default_backend(), label)
         changed = _buffers(registry, task, config, max_envs) | changed
+        if changed["impl"] == "warp":
+            compile_kernels()
     elif impl == "warp":
         raise ConfigError(f"physics.impl=warp: {name} has MJX-JAX only; allowed: auto, jax")
     theirs = attempt(f"env.name={name}", registry.load, task, config_overrides=changed)
