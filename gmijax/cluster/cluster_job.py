@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -148,9 +148,9 @@ class BackendOfNodes(Backend):
             if (without := node.call("verify", there)) is not None:
                 raise GmiFailed(*without)
 
-    def terminate(self, gmi: int, pid: int) -> None:
+    def terminate(self, gmi: int, pids: Collection[int]) -> None:
         """See `Backend`."""
-        self._nodes[self.plan.layout.node_of(gmi)].tell("terminate", gmi, pid)
+        self._nodes[self.plan.layout.node_of(gmi)].tell("terminate", gmi, pids)
 
 
 def _cpus_of_a_node(config: TrainConfig) -> int:

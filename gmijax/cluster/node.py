@@ -13,7 +13,7 @@ import platform
 import signal
 import socket
 import struct
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -243,9 +243,9 @@ class TrainingNode(Node):
             return error.gmi, error.reason
         return None
 
-    def terminate(self, gmi: int, pid: int) -> None:
+    def terminate(self, gmi: int, pids: Collection[int]) -> None:
         """See `Backend.terminate`."""
-        self._backend.terminate(gmi, pid)
+        self._backend.terminate(gmi, pids)
 
     def poll(self) -> dict[int, RemoteGmiStatus]:
         """How every GMI is."""

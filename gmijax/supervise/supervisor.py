@@ -261,7 +261,7 @@ class Supervisor:
         for process in alive:
             # Whatever is wrong with the backend, the processes must end.
             with suppress(Exception):
-                self._backend.terminate(process.gmi, process.beat.pid)
+                self._backend.terminate(process.gmi, [process.beat.pid])
         for process in alive:
             process.order_end()
         alive = _wait_for_end(alive, self._launch.timeouts.grace_s)

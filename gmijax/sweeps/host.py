@@ -111,8 +111,7 @@ class LocalHost:
         # Killing a client that is busy can harm its neighbours.
         is_killing = order == "kill" or (order == "close" and child in self._clients)
         if is_killing and self._backend is not None and child in self._clients:
-            for process in started_by(self._children[child].pid):
-                self._backend.terminate(self._clients[child], process.pid)
+            self._backend.terminate(self._clients[child], self._pids_of(child))
         getattr(self._children[child], order)()
         if order == "close":
             del self._children[child]
@@ -125,9 +124,11 @@ class LocalHost:
         """
         if self._backend is None or child not in self._clients:
             return None
-        return self._backend.why_no_client(
-            self._clients[child], [one.pid for one in started_by(self._children[child].pid)]
-        )
+        return self._backend.why_no_client(self._clients[child], self._pids_of(child))
+
+    def _pids_of(self, child: int) -> list[int]:
+        """All that it has started, and itself."""
+        return [process.pid for process in started_by(self._children[child].pid)]
 
     def load_of(self, device: str) -> GpuLoad | None:
         """What a GPU does at the moment."""

@@ -281,7 +281,7 @@ def test_two_nodes_of_one_machine_use_the_daemon_of_the_first(
         assert failed is not None
         assert failed[0] == 1
         assert "is not a client of the MPS daemon" in failed[1]
-        nodes[1].terminate(1, pid)
+        nodes[1].terminate(1, [pid, os.getpid()])
         assert [int(client) for _, client in mps.told("terminate_client")] == [pid]
         for gmi, node in enumerate(nodes):
             node.order(gmi, "kill")

@@ -396,8 +396,8 @@ def test_what_nodes_say_of_backends_is_heard_with_their_address(tmp_path: Path) 
     with pytest.raises(GmiFailed, match="GMI 2 failed: no client"):
         backend.verify({0: 10, 1: 11, 2: 12, 3: 13})
     assert told[-2:] == [("verify", {0: 10, 1: 11}), ("verify", {2: 12, 3: 13})]
-    backend.terminate(3, 13)
-    assert told[-1] == ("terminate", 3, 13)
+    backend.terminate(3, [13])
+    assert told[-1] == ("terminate", 3, [13])
 
 
 def test_a_node_starts_polls_and_ends_gmis(

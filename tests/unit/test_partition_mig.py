@@ -102,7 +102,7 @@ def test_a_gmi_sees_its_instance_and_no_daemon(monkeypatch: pytest.MonkeyPatch, 
     with open_backend(plan, here, RunPaths(tmp_path)) as backend:
         found = gmi_environment(plan, 1, {}, tmp_path, backend.environment(1))
         backend.verify({0: 1, 1: 2})
-        backend.terminate(0, 1)
+        backend.terminate(0, [1])
     assert found["CUDA_VISIBLE_DEVICES"] == fake_nvml.instance_uuid(0, 1)
     assert found["XLA_CLIENT_MEM_FRACTION"] == "0.8"
     assert list(Path(found["CUDA_MPS_PIPE_DIRECTORY"]).iterdir()) == []

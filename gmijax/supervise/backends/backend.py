@@ -73,8 +73,11 @@ class Backend:
           GmiFailed: a GMI runs without it, or that cannot be found out.
         """
 
-    def terminate(self, gmi: int, pid: int) -> None:
-        """Detaches a GMI from its GPU before it is killed; best effort, returns in seconds."""
+    def terminate(self, gmi: int, pids: Collection[int]) -> None:
+        """Detaches a GMI's processes from its GPU before they are killed.
+
+        Best effort, returns in seconds.
+        """
 
     def why_no_client(self, gmi: int, pids: Collection[int]) -> str | None:
         """Why none of these processes has the share of a GMI; None: one has, or needs none."""

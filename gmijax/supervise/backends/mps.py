@@ -131,16 +131,16 @@ class MpsBackend(Backend):
                 )
             time.sleep(_POLL_S)
 
-    def terminate(self, gmi: int, pid: int) -> None:
-        """Takes the GMI off the GPU: killing a busy client can fault its neighbours."""
+    def terminate(self, gmi: int, pids: Collection[int]) -> None:
+        """See `Backend`: killing a client that is busy can fault its neighbours."""
         device = self._devices.get(gmi)
         if device is None or device in self._unresponsive:
             return
         control = self._control_of(gmi)
         try:
-            server = control.all_client_pids().get(pid)
-            if server is not None:
-                control.terminate_client(server, pid)
+            for client, server in control.all_client_pids().items():
+                if client in pids:
+                    control.terminate_client(server, client)
         except BackendUnavailable:
             # Each attempt could cost a time limit; the other GMIs are killed without it.
             self._unresponsive.add(device)
