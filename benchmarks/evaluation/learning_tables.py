@@ -9,6 +9,7 @@ from typing import Any
 from benchmarks.cases import REWARD, TASKS
 from benchmarks.evaluation.evidence import Ratio, source
 from benchmarks.evaluation.figures import (
+    NOT_MEASURED,
     RATES,
     Figure,
     bounds,
@@ -228,16 +229,21 @@ def _tests_of(call: Call, trainer: str) -> list[list[Mapping[str, Any]]]:
     return [[one for one in checkpoints if "walk" in one] for checkpoints in runs]
 
 
-def seconds_until_it_walks(task: str, impl: str) -> Figure | None:
-    """Seconds of training by SAC in the newest call, compiled before; None if one fails."""
+def seconds_until_it_walks(task: str, impl: str) -> tuple[Figure | None, str]:
+    """By SAC in the newest call, compiled before: seconds of training, and how many seeds walk."""
     wanted = (task, "SAC", impl, False)
     calls = newest("walking-*-nvidia-*.json", _kind_of_walking)
     found = next((calls[kind] for kind in calls if (*kind[:3], kind[4]) == wanted), None)
-    if found is None or (row := found[0].results["rows"][OURS])["walk"] < row["seeds"]:
-        return None
+    if found is None:
+        return None, NOT_MEASURED
     call, path = found
+    row = call.results["rows"][OURS]
+    seeds = f"{row['walk']} of {row['seeds']}"
+    if row["training_s"] is None:
+        return None, seeds
     low, median, high = row["training_s"]
-    return Figure(median, low, high, row["walk"], frozenset([source(path.stem, call)]))
+    evidence = frozenset([source(path.stem, call)])
+    return Figure(median, low, high, row["seeds"], evidence), seeds
 
 
 def _last_tests(call: Call, trainer: str) -> Iterator[str]:

@@ -73,10 +73,12 @@ def advice() -> Values:
 @words("front")
 def front() -> Values:
     """What was measured, each with a link to the section that has its file."""
+    go1, go1_seeds = seconds_until_it_walks("go1", "warp")
     beside = [one for one in over_brax() if one.evidence.is_enough]
     return {
         "ant": said(_brief(seconds_to_mark("ant")), ".1f"),
-        "go1": said(_brief(seconds_until_it_walks("go1", "warp")), ".0f"),
+        "go1": said(_brief(go1), ".0f"),
+        "go1_seeds": Said(go1_seeds, None),
         "eight": said(_brief(eight_at_once(KEYS_OF_SWEEPS[STEPS]))),
         "mjlab": {key: said(gain) for key, gain in eight_packed(MJLAB).items()},
         "cleanrl": {key: said(gain) for key, gain in eight_packed(CLEANRL).items()},

@@ -1,7 +1,7 @@
 """What is used of tensorboardX, imported without PyTorch.
 
-tensorboardX imports PyTorch wherever it is installed, only to know a tensor when it sees one. That
-takes seconds of every start, and memory of every GMI.
+tensorboardX imports PyTorch wherever it is installed, only to recognise tensors. That adds seconds
+to every start and memory to every GMI.
 """
 
 from __future__ import annotations

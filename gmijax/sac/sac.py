@@ -50,7 +50,7 @@ def iterate(
     seen, counts = merge_sums(everyone)
     state = finish_iteration(learner, state, seen)
     figures = {
-        **policy_figures(state),
+        **policy_figures(state._replace(params=state.live)),
         "policy/temperature": jnp.exp(state.log_temperature),
         "replay/steps": memory.replay.filled.astype(jnp.float32),
         "replay/clipped": memory.replay.num_clipped,
@@ -160,6 +160,10 @@ SAC = Algorithm(
     replay=lambda learner, memory: memory.replay if learner.config.save_replay else None,
     with_replay=lambda memory, replay: memory._replace(replay=replay),
     learned=lambda state: (
-        *(state.params, state.live, state.critics, state.targets, state.log_temperature),
+        state.params,
+        state.live,
+        state.critics,
+        state.targets,
+        state.log_temperature,
     ),
 )

@@ -29,8 +29,8 @@ class SacState(NamedTuple):
     """All that learning must remember; equal, bit by bit, on every GMI.
 
     Attributes:
-      params: weights of the policy that is kept, played and exported: an average over its latest
-        updates, which `live` goes up and down around; `value` is empty.
+      params: weights of the policy that is evaluated, played and exported: an exponential average
+        of `live`; `value` is empty.
       opt_states: of critics, policy and temperature.
       obs_moments: statistics of all observations before this iteration.
       learning_rate: [] float32.

@@ -29,7 +29,7 @@ from gmijax.sac.state import SacLearner, SacState, optimizers
 from gmijax.types import Array, PRNGKey, PyTree
 
 _AVERAGE_RATE = 0.005
-"""Of the average of the policy in an update: it is over about the last 200."""
+"""Share of the way that the average goes to `live` in an update of the policy."""
 
 _ENTROPY_OF_UNIT_STD = 0.5 * math.log(2.0 * math.pi * math.e)
 

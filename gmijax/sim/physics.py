@@ -198,14 +198,15 @@ def from_mj_model(
     chosen, _ = choose_impl(impl, jax.default_backend())
     mj_model, name = plain(mj_model), name_of(mj_model)
     refuse_parts(mj_model, chosen)
-    with _refusing(mj_model, chosen):
-        if chosen == "warp":
-            compile_kernels()
+    if chosen == "warp":
+        with _refusing(mj_model, chosen):
             warp = WarpStep.load(mj_model, substeps, warp_sizes)
             model = kinematic_model(mj_model)
-            if warp_sizes is None and warp.bounds is not None:
-                warn_of_many(name, chosen, *warp.bounds[:2], warp.sizes)
-            return Physics(chosen, mj_model, model, substeps, max_envs, warp)
+        if warp_sizes is None and warp.bounds is not None:
+            warn_of_many(name, chosen, *warp.bounds[:2], warp.sizes)
+        compile_kernels(mj_model)
+        return Physics(chosen, mj_model, model, substeps, max_envs, warp)
+    with _refusing(mj_model, chosen):
         model = mjx.put_model(mj_model, impl="jax")
         # It finds what `put_model` does not.
         data = jax.eval_shape(lambda: mjx.make_data(model))

@@ -15,7 +15,7 @@ from gmijax.sim.impl import ON_GPU
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
-# The first run of a task compiles its kernels, for minutes.
+# The first run of a task compiles its kernels, for a minute or more.
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(1200)]
 
 SMALL = (

@@ -17,7 +17,7 @@ from benchmarks import records, walking, walking_tests
 from benchmarks.evaluation.figures import NOT_MEASURED
 from benchmarks.evaluation.page import TABLES
 from benchmarks.records import ResultsFile, read_calls
-from benchmarks.walking import _theirs, summary, walks_from
+from benchmarks.walking import _theirs, apart, summary, walks_from
 from benchmarks.walking_tests import Policy, policy_of, walks_twice
 from gmijax.config import EnvConfig
 from gmijax.config.schema import to_dict
@@ -75,12 +75,23 @@ def test_script_seeds_are_some_of_the_seeds(count, more, tmp_path, monkeypatch):
         walking.main()
 
 
-def test_a_script_that_cannot_train_ends_the_call_before_any_seed(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("steps", "kept"),
+    [([10, 20, 30, 31], 3), ([10, 20, 30, 35], 4), ([10, 20, 30], 3), ([10, 12], 2), ([], 0)],
+)
+def test_a_last_checkpoint_soon_after_the_one_before_is_not_tested(steps, kept):
+    checkpoints = [{"env_steps": one} for one in steps]
+    assert apart(checkpoints) == checkpoints[:kept]
+
+
+@pytest.mark.parametrize("more", [(), ("--cold",)])
+def test_a_script_that_cannot_train_ends_the_call_before_any_seed(more, tmp_path, monkeypatch):
     ran = []
     monkeypatch.setattr(walking, "run_command", lambda command, *_: ran.append(command) or 1)
-    given = ("env=go1", "num_envs=64", "--script=", f"--runs={tmp_path}", f"--out={tmp_path}")
+    where = (f"--runs={tmp_path}", f"--out={tmp_path}")
+    given = ("env=go1", "num_envs=64", "--script=", *where, *more)
     monkeypatch.setattr("sys.argv", ["walking", *given])
-    with pytest.raises(ConfigError, match=r"^--script: a short training left no checkpoint"):
+    with pytest.raises(ConfigError, match=r"^--script: left no checkpoint"):
         walking.main()
     assert len(ran) == 2
 

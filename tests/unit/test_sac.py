@@ -47,7 +47,7 @@ from gmijax.sac.replay import (
     sample_obs,
 )
 from gmijax.sac.sac import SAC, step_into_replay
-from gmijax.sac.updates import target_entropy
+from gmijax.sac.updates import target_entropy, update_critics, update_policy
 from gmijax.sim.interface import EnvSpec
 
 ENV = point_mass()
@@ -365,6 +365,33 @@ def test_experience_is_made_by_the_policy_that_learns() -> None:
     chex.assert_trees_all_equal(kept, expected)
     with pytest.raises(AssertionError):
         chex.assert_trees_all_close(learning, expected)
+
+
+def test_the_policy_that_learns_is_the_one_that_is_asked() -> None:
+    """Nothing that is learnt depends on the average."""
+    learner = learner_of()
+    state = jax.jit(partial(SAC.init, learner, 2))(jax.random.key(0))
+    envs = begin_episodes(ENV, jax.random.key(1), 0, 16, kept_steps=64)
+    memory = SAC.begin(learner, ENV, envs)
+    step = jax.jit(partial(step_into_replay, ENV, learner, ENV.model))
+    for _ in range(6):
+        memory, _ = step(state, memory)
+
+    @jax.jit
+    def learnt(state: Any) -> Any:
+        given = learner, LocalCollectives(), memory.replay, state
+        by_critics, by_policy = (
+            update(*given, jax.random.key(2))[0] for update in (update_critics, update_policy)
+        )
+        log_temperature = by_critics.log_temperature
+        return by_critics.critics, log_temperature, by_policy.live
+
+    other = jax.tree.map(lambda leaf: leaf + 1.0, state.params)
+    expected = learnt(state)
+    chex.assert_trees_all_equal(learnt(state._replace(params=other)), expected)
+    for found, one in zip(learnt(state._replace(live=other)), expected, strict=True):
+        with pytest.raises(AssertionError):
+            chex.assert_trees_all_close(found, one)
 
 
 @pytest.mark.parametrize(("updates", "every", "policy"), [(2, 4, 2), (4, 2, 8)])

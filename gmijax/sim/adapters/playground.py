@@ -64,11 +64,11 @@ def make(
     if "impl" in config:
         changed["impl"], _ = choose_impl(impl, jax.default_backend(), label)
         changed = _buffers(registry, task, config, max_envs) | changed
-        if changed["impl"] == "warp":
-            compile_kernels()
     elif impl == "warp":
         raise ConfigError(f"physics.impl=warp: {name} has MJX-JAX only; allowed: auto, jax")
     theirs = attempt(f"env.name={name}", registry.load, task, config_overrides=changed)
+    if changed.get("impl") == "warp":
+        compile_kernels(theirs.mj_model)
     env = from_playground(theirs, name=label, episode_length=config.episode_length)
     if has_randomizer(task):
         draw = partial(_drawn, theirs, registry.get_domain_randomizer(task))
