@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 from gmijax.config.sweep import Ranking
 from gmijax.runs.folder import RunPaths
@@ -13,6 +13,9 @@ from gmijax.runs.history import number_in, read_metrics
 from gmijax.sweeps.objective import find, value_of
 
 State: TypeAlias = Literal["waiting", "running", "completed", "failed", "pruned", "interrupted"]
+
+_LEAST_S: Final = 0.5
+"""Lines of metrics have the time at which they are read, ten times a second."""
 
 
 @dataclass
@@ -83,10 +86,11 @@ class Progress:
 
     @property
     def mean_steps_per_s(self) -> float | None:
-        """From the first line of metrics after its latest start on; None before there are two."""
-        if self.updated_s is None or self.reported_s is None or self.reports < 2:
+        """From the first line of metrics after its latest start on; None if that is too short."""
+        if self.updated_s is None or self.reported_s is None:
             return self.earlier_steps_per_s if self.started_s is None else None
-        return (self.env_steps - self._first_steps) / max(1e-9, self.reported_s - self.updated_s)
+        passed_s = self.reported_s - self.updated_s
+        return (self.env_steps - self._first_steps) / passed_s if passed_s >= _LEAST_S else None
 
     def report(self, line: Mapping[str, Any], ranking: Ranking) -> None:
         """Takes in a line of metrics that has just come."""

@@ -7,6 +7,7 @@ import errno
 import io
 import math
 import os
+import textwrap
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -244,17 +245,27 @@ def draw_curves(jobs: Sequence[AnyJob], ranking: Ranking, paths: SweepPaths) -> 
 
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.add_subplot()
-    for label, own in drawn.items():
+    for label, own in zip(told_apart(list(drawn)), drawn.values(), strict=True):
         steps, middle = spread([job.progress.curve for job in own])
         axes.plot(steps, middle.mean, label=f"{label} (n={len(own)})")
         if len(own) > 1:
             axes.fill_between(steps, middle.low, middle.high, alpha=0.2)
     axes.set(xlabel="environment steps", ylabel=ranking.objective)
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
+    axes.legend(fontsize="small").set_in_layout(False)  # However long it is, curves have room.
     drawn_png = io.BytesIO()
     figure.savefig(drawn_png, dpi=120)
     write_bytes(paths.curves, drawn_png.getvalue())
+
+
+def told_apart(labels: Sequence[str]) -> list[str]:
+    """Labels for a legend: without the words that all have, in two lines at most."""
+    words = [label.split() for label in labels]
+    shared = set.intersection(*map(set, words)) if len(labels) > 1 else set[str]()
+    own = [" ".join(word for word in of_label if word not in shared) for of_label in words]
+    both = zip(own, labels, strict=True)
+    short = [textwrap.shorten(one or label, 130, placeholder=" ...") for one, label in both]
+    return [textwrap.fill(one, 70) for one in short]
 
 
 def spread(curves: Sequence[Sequence[tuple[int, float]]]) -> tuple[np.ndarray, SeedSummary]:

@@ -9,6 +9,7 @@ import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ from gmijax.sweeps.packs import most_together, require_packable
 from gmijax.sweeps.paths import ENV_PACK_DIR, SweepPaths
 from gmijax.sweeps.profile_jobs import profiled_job
 from gmijax.sweeps.progress import Progress
-from gmijax.sweeps.report import JobsReport, spread, tables
+from gmijax.sweeps.report import JobsReport, draw_curves, spread, tables, told_apart
 from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
 from gmijax.sweeps.words import announce
 
@@ -428,6 +429,40 @@ def test_what_has_no_window_is_averaged_over_the_last_tenth() -> None:
     for bad in (None, float("nan"), float("inf"), "1"):
         nothing.take({"env_steps": 1, "env_steps_per_s": bad}, sweep)
     assert nothing.value is None
+
+
+def test_a_legend_has_what_tells_settings_apart() -> None:
+    command = "command=python -m train --env go1 --lr {} --seed {}"
+    assert told_apart([command.format(0.1, 0), command.format(0.3, 0)]) == ["0.1", "0.3"]
+    assert told_apart(["lr=1 seed=0"]) == ["lr=1 seed=0"]
+    assert told_apart(["lr=1", "lr=1 wd=2"]) == ["lr=1", "wd=2"]
+    long = told_apart([40 * "a=1 "])[0].splitlines()
+    assert len(long) == 2
+    assert max(map(len, long)) <= 70
+
+
+def test_commands_of_any_length_are_drawn(tmp_path: Path) -> None:
+    """Matplotlib warns, which is an error here, when nothing is left of the picture."""
+    jobs: list[Any] = []
+    for number in range(30):
+        words = " ".join(f"--key-{n} {number}{n}" for n in range(60))
+        progress = Progress(curve=[(0, 0.0), (100, float(number))])
+        jobs.append(SimpleNamespace(overrides={"command": f"train {words}"}, progress=progress))
+    paths = SweepPaths(tmp_path)
+    paths.curves.parent.mkdir(parents=True, exist_ok=True)
+    draw_curves(jobs, SweepConfig(objective="return"), paths)
+    assert paths.curves.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(("passed_s", "rate"), [(1e-4, None), (0.1, None), (2.0, 1500.0)])
+def test_lines_that_are_read_together_have_no_rate(
+    passed_s: float, rate: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    progress, sweep = Progress(), SweepConfig()
+    for now_s, steps in ((10.0, 1000), (10.0 + passed_s, 4000)):
+        monkeypatch.setattr("gmijax.sweeps.progress.time.monotonic", lambda now_s=now_s: now_s)
+        progress.report({"env_steps": steps}, sweep)
+    assert progress.mean_steps_per_s == rate
 
 
 def test_lines_of_older_versions_do_not_say_that_they_can_be_compared() -> None:
