@@ -317,10 +317,14 @@ def test_the_temperature_falls_where_there_is_too_much_noise() -> None:
         assert np.sign(grad) == sign
 
 
-def run_of(learner: Any, iterations: int) -> Any:
+def begun(learner: Any) -> tuple[Any, Any]:
     state = jax.jit(partial(SAC.init, learner, 2))(jax.random.key(0))
     envs = begin_episodes(ENV, jax.random.key(1), 0, 16, kept_steps=64)
-    memory = SAC.begin(learner, ENV, envs)
+    return state, SAC.begin(learner, ENV, envs)
+
+
+def run_of(learner: Any, iterations: int) -> Any:
+    state, memory = begun(learner)
     iterate: Any = jax.jit(partial(SAC.iterate, ENV, learner, LocalCollectives(), ENV.model))
     for _ in range(iterations):
         before = state
@@ -351,45 +355,26 @@ def test_each_part_learns_when_it_is_its_turn() -> None:
         assert float(after.obs_moments.count) == 32 * number  # Each observation counts once.
 
 
-def test_experience_is_made_by_the_policy_that_learns() -> None:
+def test_what_is_made_and_learnt_depends_on_the_policy_that_learns_alone() -> None:
     learner = learner_of()
-    state = jax.jit(partial(SAC.init, learner, 2))(jax.random.key(0))
-    envs = begin_episodes(ENV, jax.random.key(1), 0, 16, kept_steps=64)
-    memory = SAC.begin(learner, ENV, envs)
+    state, memory = begun(learner)
     step = jax.jit(partial(step_into_replay, ENV, learner, ENV.model))
-    other = jax.tree.map(lambda leaf: leaf + 1.0, state.params)
-    expected, kept, learning = (
-        step(one, memory)[0].replay
-        for one in (state, state._replace(params=other), state._replace(live=other))
-    )
-    chex.assert_trees_all_equal(kept, expected)
-    with pytest.raises(AssertionError):
-        chex.assert_trees_all_close(learning, expected)
-
-
-def test_the_policy_that_learns_is_the_one_that_is_asked() -> None:
-    """Nothing that is learnt depends on the average."""
-    learner = learner_of()
-    state = jax.jit(partial(SAC.init, learner, 2))(jax.random.key(0))
-    envs = begin_episodes(ENV, jax.random.key(1), 0, 16, kept_steps=64)
-    memory = SAC.begin(learner, ENV, envs)
-    step = jax.jit(partial(step_into_replay, ENV, learner, ENV.model))
-    for _ in range(6):
-        memory, _ = step(state, memory)
 
     @jax.jit
-    def learnt(state: Any) -> Any:
+    def made_and_learnt(state: Any) -> Any:
         given = learner, LocalCollectives(), memory.replay, state
         by_critics, by_policy = (
             update(*given, jax.random.key(2))[0] for update in (update_critics, update_policy)
         )
-        log_temperature = by_critics.log_temperature
-        return by_critics.critics, log_temperature, by_policy.live
+        experience = step(state, memory)[0].replay
+        return experience, by_critics.critics, by_critics.log_temperature, by_policy.live
 
+    for _ in range(6):
+        memory, _ = step(state, memory)
     other = jax.tree.map(lambda leaf: leaf + 1.0, state.params)
-    expected = learnt(state)
-    chex.assert_trees_all_equal(learnt(state._replace(params=other)), expected)
-    for found, one in zip(learnt(state._replace(live=other)), expected, strict=True):
+    expected = made_and_learnt(state)
+    chex.assert_trees_all_equal(made_and_learnt(state._replace(params=other)), expected)
+    for found, one in zip(made_and_learnt(state._replace(live=other)), expected, strict=True):
         with pytest.raises(AssertionError):
             chex.assert_trees_all_close(found, one)
 
