@@ -79,9 +79,7 @@ class Benchmark:
         count = max(1, min(self._given.gpus, len(self._machine.gpus), self._given.seeds))
         if not self._given.cold:
             for trainer in trainers:
-                self._require_checkpoints(
-                    trainer, self._train(trainer, "compile", Part(), is_short=True)
-                )
+                self._train(trainer, "compile", Part(), is_short=True)
 
         def seeds_of(number: int, part: Part) -> None:
             self._seeds(str(number), trainers, range(number, self._given.seeds, count), part)
@@ -97,16 +95,10 @@ class Benchmark:
             if trainer == SCRIPT and seed >= self._script_seeds:
                 continue
             run = {"trainer": trainer, "seed": seed, **self._train(trainer, str(seed), part)}
-            self._require_checkpoints(trainer, run)
             mine.append(run)
             self.runs.append(run)
             self._write()
         self._test(name, mine, part)
-
-    def _require_checkpoints(self, trainer: str, run: Mapping[str, Any]) -> None:
-        """Of the script, whose exit code says nothing: it may fail at its film."""
-        if trainer == SCRIPT and not run["checkpoints"]:
-            raise ConfigError("--script: left no checkpoint, see above")
 
     def _train(
         self, trainer: str, name: str, part: Part, *, is_short: bool = False
@@ -128,11 +120,22 @@ class Benchmark:
         code = run_command([*part.prefix, *command], self._trained_by_s, variables)
         command_s = time.time() - started_s
         found = _ours(folder, started_s) if trainer == OURS else _theirs(folder, started_s)
+        if trainer == SCRIPT and not found:
+            self._refuse_a_script_that_cannot_train()
         checkpoints = apart(found)
         for one in checkpoints:  # Environments take hundreds of MB; only policies are tested.
             for environments in Path(one["folder"]).glob("gmi_*"):
                 shutil.rmtree(environments)
         return {"code": code, "command_s": command_s, "checkpoints": checkpoints}
+
+    def _refuse_a_script_that_cannot_train(self) -> None:
+        """Raises ConfigError if its first training left nothing although there was time.
+
+        Its exit code says nothing: it may fail at its film.
+        """
+        is_first = all(run["trainer"] != SCRIPT for run in self.runs)
+        if is_first and time.monotonic() < self._trained_by_s:
+            raise ConfigError("--script: left no checkpoint, see above")
 
     def _our_command(self, folder: Path, seed: str, *, is_short: bool) -> list[str]:
         config = self._config

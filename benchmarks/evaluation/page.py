@@ -12,10 +12,7 @@ from benchmarks.evaluation import claims, learning_tables, seed_tables  # noqa: 
 from benchmarks.evaluation.async_tables import asynchronous_gains, beside_a_learner
 from benchmarks.evaluation.evidence import Ratio, Said
 from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, Figure, said, said_bounds
-from benchmarks.evaluation.learning_tables import (
-    seconds_to_mark,
-    seconds_until_it_walks,
-)
+from benchmarks.evaluation.learning_tables import seconds_to_mark, seconds_until_it_walks
 from benchmarks.evaluation.other_tables import seconds_to_recover
 from benchmarks.evaluation.pack_tables import CLEANRL, MJLAB, eight_packed
 from benchmarks.evaluation.peer_tables import over_brax

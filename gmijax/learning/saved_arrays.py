@@ -56,9 +56,9 @@ def restore(folder: Path, template: T) -> T:
         raise ConfigError(f"checkpoint {folder} does not fit this job: {why}") from error
     wanted = _shapes(jax.eval_shape(_storable, template))
     for name in wanted.keys() - saved.keys():
-        once = name.replace(_LEARNING, _KEPT, 1)
-        if name.startswith(_LEARNING) and once in saved:
-            saved[name] = saved[once]
+        kept = _KEPT + name.removeprefix(_LEARNING)
+        if name.startswith(_LEARNING) and kept in saved:
+            saved[name] = saved[kept]
     if why := _difference(_shapes(saved), wanted):
         raise ConfigError(f"checkpoint {folder} does not fit this job: {why}")
     return jax.tree.map_with_path(lambda path, like: _restored(like, saved[_name(path)]), template)

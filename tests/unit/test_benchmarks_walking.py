@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -94,6 +95,16 @@ def test_a_script_that_cannot_train_ends_the_call_before_any_seed(more, tmp_path
     with pytest.raises(ConfigError, match=r"^--script: left no checkpoint"):
         walking.main()
     assert len(ran) == 2
+
+
+def test_a_script_without_time_for_a_checkpoint_does_not_end_the_call(tmp_path, monkeypatch):
+    ran = []
+    monkeypatch.setattr(walking, "run_command", lambda command, *_: ran.append(command) or 1)
+    monkeypatch.setattr(walking, "deadline", lambda seconds: -math.inf)
+    where = (f"--runs={tmp_path}", f"--out={tmp_path}")
+    monkeypatch.setattr("sys.argv", ["walking", "env=go1", "num_envs=64", "--script=", *where])
+    assert walking.main() == 1
+    assert "benchmarks.walking_tests" in ran[-1]
 
 
 @pytest.mark.parametrize("is_cold", [True, False])

@@ -67,23 +67,17 @@ def test_failure_of_the_device_is_not_the_checkpoints(
         restore_with(RuntimeError("RESOURCE_EXHAUSTED"), monkeypatch, tmp_path)
 
 
-class Sac(NamedTuple):
-    params: Any
-    targets: Any
-    live: Any = None
-
-
 def test_a_policy_from_before_averages_goes_on_learning(tmp_path: Path):
     run = RunPaths(tmp_path)
-    save_learner(run, 1, Sac({"w": jnp.arange(3.0)}, jnp.ones(2)))
+    save_learner(run, 1, {"params": {"w": jnp.arange(3.0)}, "targets": jnp.ones(2)})
     old = finish_checkpoint(run, CheckpointMeta("ant", "sac", 1, 1, 8, ((8,), (8,)), "jax"))
-    like = Sac({"w": jnp.zeros(3)}, jnp.zeros(2), {"w": jnp.zeros(3)})
+    like = {"params": {"w": jnp.zeros(3)}, "targets": jnp.zeros(2), "live": {"w": jnp.zeros(3)}}
     found = restore_learner(old, like)
-    assert found.live["w"].tolist() == found.params["w"].tolist() == [0.0, 1.0, 2.0]
+    assert found["live"]["w"].tolist() == found["params"]["w"].tolist() == [0.0, 1.0, 2.0]
     with pytest.raises(ConfigError, match=r"its live.w is \[3\], that of this job \[4\]"):
-        restore_learner(old, like._replace(live={"w": jnp.zeros(4)}))
+        restore_learner(old, like | {"live": {"w": jnp.zeros(4)}})
     with pytest.raises(ConfigError, match=r"it has no live.x, this job has$"):
-        restore_learner(old, like._replace(live={"x": jnp.zeros(3), "w": jnp.zeros(3)}))
+        restore_learner(old, like | {"live": {"x": jnp.zeros(3), "w": jnp.zeros(3)}})
 
 
 class Before(NamedTuple):

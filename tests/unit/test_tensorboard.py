@@ -7,24 +7,21 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 
-def test_torch_stays_out_of_a_training_and_can_be_imported_later(tmp_path: Path) -> None:
-    (tmp_path / "torch.py").write_text("Tensor = int\n")
-    program = """
-import sys
+LATER = """
 import gmijax.runs.tensorboard
 assert "torch" not in sys.modules, "imported"
 import torch
 assert torch.Tensor is int
 """
-    env = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
-    run = subprocess.run([sys.executable, "-c", program], env=env, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
+BEFORE = "import torch, gmijax.runs.tensorboard; assert sys.modules['torch'] is torch"
 
 
-def test_torch_that_is_there_stays(tmp_path: Path) -> None:
+@pytest.mark.parametrize("program", [LATER, BEFORE])
+def test_torch_stays_out_and_is_imported_before_or_later(program: str, tmp_path: Path) -> None:
     (tmp_path / "torch.py").write_text("Tensor = int\n")
-    program = "import sys, torch, gmijax.runs.tensorboard; assert sys.modules['torch'] is torch"
     env = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
-    run = subprocess.run([sys.executable, "-c", program], env=env, capture_output=True, text=True)
+    words = [sys.executable, "-c", f"import sys\n{program}"]
+    run = subprocess.run(words, env=env, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
