@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from benchmarks.cases import REWARD, TASKS
-from benchmarks.evaluation.evidence import Ratio, source
+from benchmarks.evaluation.evidence import Ratio
 from benchmarks.evaluation.figures import (
-    NOT_MEASURED,
     RATES,
     Figure,
     bounds,
@@ -21,11 +19,9 @@ from benchmarks.evaluation.figures import (
     sources_of,
 )
 from benchmarks.evaluation.seed_tables import of_algorithms
-from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
+from benchmarks.evaluation.writer import Calls, Rows, table, table_of_calls
 from benchmarks.outcomes import Curve, seconds_to
-from benchmarks.records import Call, calls_by_date
-from benchmarks.walking import OURS, SCRIPT
-from gmijax.sim.robots import robot_name
+from benchmarks.records import calls_by_date
 
 NEARLY = 0.9
 """Of a return, that is reached more surely than all of it."""
@@ -183,86 +179,3 @@ def throughput() -> Rows:
             found = [rate("tasks-warp", f"{task} warp {envs}", key) for key in RATES]
             if all(found):
                 yield [f"`{task}`", f"{envs:,}", *(shown(one, ",.0f") for one in found)]
-
-
-def _kind_of_walking(call: Call) -> tuple[str, str, str, str | None, bool]:
-    """Task or robot, algorithm of our trainings as it is written, physics, GPU and start."""
-    assert call.settings is not None
-    given = dict(word.split("=", 1) for word in call.settings["overrides"])
-    algo = given.get("algo", "ppo").upper()
-    task = call.results["task"]
-    robot = robot_name(task.removeprefix("playground/"))
-    return robot or task, algo, _physics(call, OURS), call.device, call.settings["cold"]
-
-
-@table_of_calls(
-    "walking",
-    "task | MJX | trained by | programs | seeds that walk: | million steps: | "
-    "seconds of training: | seconds of the command: | at the end: million steps: | "
-    "do not fall: | error, m/s: | rad/s:",
-    lambda: newest("walking-*-nvidia-*.json", _kind_of_walking),
-)
-def walking(calls: Calls) -> Rows:
-    """How long robots are trained until they walk: median, least and most of seeds."""
-    for (task, algo, _, _, is_cold), (call, _) in sorted(calls.items()):
-        start = "compiled anew" if is_cold else "from the cache"
-        for trainer, row in call.results["rows"].items():
-            name = trainer if trainer == SCRIPT else f"{trainer} {algo}"
-            seeds = f"{row['walk']} of {row['seeds']}"
-            spreads = (
-                _spread(row["env_steps"], 1e-6),
-                *(_spread(row[key]) for key in ("training_s", "command_s")),
-            )
-            about = [f"`{task}`", _physics(call, trainer), name, start, seeds]
-            yield [*about, *spreads, *_last_tests(call, trainer)]
-
-
-def _physics(call: Call, trainer: str) -> str:
-    """The MJX implementation that this trainer's policies were trained and tested with."""
-    found = (one["walk"]["impl"] for tests in _tests_of(call, trainer) for one in tests)
-    return next(found, "")
-
-
-def _tests_of(call: Call, trainer: str) -> list[list[Mapping[str, Any]]]:
-    """The tested checkpoints of every training."""
-    runs = [run["checkpoints"] for run in call.results["runs"] if run["trainer"] == trainer]
-    return [[one for one in checkpoints if "walk" in one] for checkpoints in runs]
-
-
-def seconds_until_it_walks(task: str, impl: str) -> tuple[Figure | None, str]:
-    """By SAC in the newest call, compiled before: seconds of training, and how many seeds walk."""
-    wanted = (task, "SAC", impl, False)
-    calls = newest("walking-*-nvidia-*.json", _kind_of_walking)
-    found = next((calls[kind] for kind in calls if (*kind[:3], kind[4]) == wanted), None)
-    if found is None:
-        return None, NOT_MEASURED
-    call, path = found
-    row = call.results["rows"][OURS]
-    seeds = f"{row['walk']} of {row['seeds']}"
-    if row["training_s"] is None:
-        return None, seeds
-    low, median, high = row["training_s"]
-    evidence = frozenset([source(path.stem, call)])
-    return Figure(median, low, high, row["seeds"], evidence), seeds
-
-
-def _last_tests(call: Call, trainer: str) -> Iterator[str]:
-    """The last test of every training: medians over seeds."""
-    last = [tests[-1] for tests in _tests_of(call, trainer) if tests]
-    settled = [one["walk"]["settled"] for one in last]
-    for form, values in (
-        (".0f", [one["env_steps"] / 1e6 for one in last]),
-        (".1%", [one["walk"]["upright"] for one in last]),
-        (".2f", [errors["linear_m_per_s"] for errors in settled]),
-        (".2f", [errors["yaw_rad_per_s"] for errors in settled]),
-    ):
-        # None: all have left the field, or fallen at once.
-        known = [value for value in values if value is not None]
-        yield format(statistics.median(known), form) if known else ""
-
-
-def _spread(values: Sequence[float] | None, scale: float = 1.0) -> str:
-    if values is None:
-        return ""
-    least, median, most = (f"{value * scale:.0f}" for value in values)
-    return f"{median} ({least} to {most})"

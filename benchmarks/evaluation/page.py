@@ -12,7 +12,7 @@ from benchmarks.evaluation import claims, learning_tables, seed_tables  # noqa: 
 from benchmarks.evaluation.async_tables import asynchronous_gains, beside_a_learner
 from benchmarks.evaluation.evidence import Ratio, Said
 from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, Figure, said, said_bounds
-from benchmarks.evaluation.learning_tables import seconds_to_mark, seconds_until_it_walks
+from benchmarks.evaluation.learning_tables import seconds_to_mark
 from benchmarks.evaluation.other_tables import seconds_to_recover
 from benchmarks.evaluation.pack_tables import CLEANRL, MJLAB, eight_packed
 from benchmarks.evaluation.peer_tables import over_brax
@@ -20,6 +20,7 @@ from benchmarks.evaluation.serving_tables import mps_gains
 from benchmarks.evaluation.sweep_tables import KEYS as KEYS_OF_SWEEPS
 from benchmarks.evaluation.sweep_tables import eight_at_once, processes_over_program
 from benchmarks.evaluation.tables import best_plan_ratios, fixed_total_ratios, over_one_gpu
+from benchmarks.evaluation.walking_tables import seconds_until_it_walks
 from benchmarks.evaluation.writer import SAID, TABLES, Values, words
 
 __all__ = ["SAID", "TABLES"]

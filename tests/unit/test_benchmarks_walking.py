@@ -17,8 +17,9 @@ import gmijax
 from benchmarks import records, walking, walking_tests
 from benchmarks.evaluation.figures import NOT_MEASURED
 from benchmarks.evaluation.page import TABLES
+from benchmarks.evaluation.walking_tables import seconds_until_it_walks
 from benchmarks.records import ResultsFile, read_calls
-from benchmarks.walking import _theirs, apart, summary, walks_from
+from benchmarks.walking import SCRIPT, _theirs, apart, summary, walks_from
 from benchmarks.walking_tests import Policy, policy_of, walks_twice
 from gmijax.config import EnvConfig
 from gmijax.config.schema import to_dict
@@ -291,37 +292,70 @@ def test_a_policy_of_brax_gets_its_observations_by_name(tmp_path):
     assert np.asarray(acted) == pytest.approx(np.asarray(act(named, key)[0]), abs=1e-6)
 
 
+def _add_call(folder, seconds, given, *, task="go1", is_cold=False, seeds=5, script=False):
+    """A call of a walking benchmark, as if it had been measured."""
+    settings = {"cold": is_cold, "overrides": given}
+    file = ResultsFile(folder / "walking-go1-nvidia-h100.json", "walking", settings, device="H100")
+    spread = {"training_s": [50.0, seconds, 120.0], "command_s": None}
+    row = {"seeds": seeds, "walk": seeds, "env_steps": [4e7, 5e7, 6e7], **spread}
+    errors = {"linear_m_per_s": seconds / 1000, "yaw_rad_per_s": None}
+    walk = {"upright": 0.995, "settled": errors, "impl": "warp"}
+    tests = [{"env_steps": 7e7, "walk": walk}, {"env_steps": 8e7}]
+    trainers = {"gmijax": row} | ({SCRIPT: row | {"seeds": 1, "walk": 0}} if script else {})
+    runs = [{"trainer": trainer, "checkpoints": tests} for trainer in trainers] * seeds
+    with file.changing() as results:
+        results.update(task=task, rows=trainers, runs=runs)
+
+
+def _rows_of_the_table():
+    """Without the commit, which is that of the tests."""
+    lines = TABLES["walking"]()
+    cells = [line.split(" | ") for line in lines if line.startswith("| `")]
+    return [" | ".join([*row[:3], *row[4:]]) for row in cells]
+
+
+PPO, SAC, CACHED = "`go1` | warp | gmijax PPO", "`go1` | warp | gmijax SAC", "from the cache"
+WALK, SHARE, MOST = "5 of 5 | 50 (40 to 60)", "70 | 99.5%", "(50 to 120)"
+
+
 def test_the_table_has_the_newest_call_of_each_kind_of_start(tmp_path, monkeypatch):
     monkeypatch.setattr(records, "RESULTS", tmp_path)
     assert TABLES["walking"]() == [NOT_MEASURED]
-    row = {"seeds": 5, "walk": 5, "env_steps": [4e7, 5e7, 6e7]}
+    # Playground's name is the same robot's.
+    _add_call(tmp_path, 99.0, [], task="playground/Go1JoystickFlatTerrain")
+    _add_call(tmp_path, 60.0, ["env=go1"])
+    _add_call(tmp_path, 100.0, [], is_cold=True)
     by_sac = ["env=go1", "algo=sac"]
-    for is_cold, seconds, given, task in (
-        # Playground's name is the same robot's.
-        (False, 99.0, [], "playground/Go1JoystickFlatTerrain"),
-        (False, 60.0, ["env=go1"], "go1"),
-        (True, 100.0, [], "go1"),
-        (False, 70.0, by_sac, "playground/Go1JoystickFlatTerrain"),
-    ):
-        path = tmp_path / "walking-go1-nvidia-h100.json"
-        settings = {"cold": is_cold, "overrides": given}
-        file = ResultsFile(path, "walking", settings, device="H100")
-        spread = {"training_s": [50.0, seconds, 120.0], "command_s": None}
-        errors = {"linear_m_per_s": seconds / 1000, "yaw_rad_per_s": None}
-        walk = {"upright": 0.995, "settled": errors, "impl": "warp"}
-        tested = {"env_steps": 7e7, "walk": walk}
-        runs = [{"trainer": "gmijax", "checkpoints": [tested, {"env_steps": 8e7}]}] * 5
-        with file.changing() as results:
-            results.update(task=task, rows={"gmijax": row | spread}, runs=runs)
-    lines = TABLES["walking"]()
-    rows = [line for line in lines if line.startswith("| `")]
-    walk, share, most = "5 of 5 | 50 (40 to 60)", "70 | 99.5%", "(50 to 120)"
-    ppo, sac, cached = "`go1` | warp | gmijax PPO", "`go1` | warp | gmijax SAC", "from the cache"
-    assert rows == [
-        f"| {ppo} | {cached} | {walk} | 60 {most} |  | {share} | 0.06 |  |",
-        f"| {ppo} | compiled anew | {walk} | 100 {most} |  | {share} | 0.10 |  |",
-        f"| {sac} | {cached} | {walk} | 70 {most} |  | {share} | 0.07 |  |",
+    _add_call(tmp_path, 70.0, by_sac, task="playground/Go1JoystickFlatTerrain")
+    assert _rows_of_the_table() == [
+        f"| {PPO} | {CACHED} | {WALK} | 60 {MOST} |  | {SHARE} | 0.06 |  |",
+        f"| {PPO} | compiled anew | {WALK} | 100 {MOST} |  | {SHARE} | 0.10 |  |",
+        f"| {SAC} | {CACHED} | {WALK} | 70 {MOST} |  | {SHARE} | 0.07 |  |",
     ]
+
+
+def test_a_call_with_fewer_seeds_does_not_take_the_place_of_one_with_more(tmp_path, monkeypatch):
+    monkeypatch.setattr(records, "RESULTS", tmp_path)
+    by_sac = ["env=go1", "algo=sac"]
+    _add_call(tmp_path, 70.0, by_sac)
+    _add_call(tmp_path, 50.0, by_sac, seeds=2)
+    rows = [f"| {SAC} | {CACHED} | {WALK} | 70 {MOST} |  | {SHARE} | 0.07 |  |"]
+    assert _rows_of_the_table() == rows
+    median, seeds = seconds_until_it_walks("go1", "warp")
+    assert (median.median, seeds) == (70.0, "5 of 5")
+    # Playground's script is compared with ours of the same call.
+    _add_call(tmp_path, 60.0, by_sac, seeds=2, script=True)
+    few, script = WALK.replace("5 of 5", "2 of 2"), WALK.replace("5 of 5", "0 of 1")
+    beside = [
+        f"| {SAC} | {CACHED} | {few} | 60 {MOST} |  | {SHARE} | 0.06 |  |",
+        f"| `go1` | warp | {SCRIPT} | {CACHED} | {script} | 60 {MOST} |  | {SHARE} | 0.06 |  |",
+    ]
+    assert _rows_of_the_table() == [*rows, *beside]
+    assert seconds_until_it_walks("go1", "warp")[1] == "5 of 5"
+    # One with as many seeds says it all.
+    _add_call(tmp_path, 60.0, by_sac, script=True)
+    whole = [line.replace("2 of 2", "5 of 5") for line in beside]
+    assert _rows_of_the_table() == whole
 
 
 def test_one_program_tests_all_checkpoints_of_a_kind(tmp_path, monkeypatch):
