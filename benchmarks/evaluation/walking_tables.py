@@ -63,12 +63,11 @@ def walking(calls: Calls) -> Rows:
         start = "compiled anew" if is_cold else "from the cache"
         for trainer, row in call.results["rows"].items():
             name = trainer if trainer == SCRIPT else f"{trainer} {algo}"
-            seeds = f"{row['walk']} of {row['seeds']}"
             spreads = (
                 _spread(row["env_steps"], 1e-6),
                 *(_spread(row[key]) for key in ("training_s", "command_s")),
             )
-            about = [f"`{task}`", _physics(call, trainer), name, call.commit, start, seeds]
+            about = [f"`{task}`", _physics(call, trainer), name, call.commit, start, _walk(row)]
             yield [*about, *spreads, *_last_tests(call, trainer)]
 
 
@@ -93,12 +92,15 @@ def seconds_until_it_walks(task: str, impl: str) -> tuple[Figure | None, str]:
         return None, NOT_MEASURED
     call, path = found
     row = call.results["rows"][OURS]
-    seeds = f"{row['walk']} of {row['seeds']}"
     if row["training_s"] is None:
-        return None, seeds
+        return None, _walk(row)
     low, median, high = row["training_s"]
     evidence = frozenset([source(path.stem, call)])
-    return Figure(median, low, high, row["seeds"], evidence), seeds
+    return Figure(median, low, high, row["seeds"], evidence), _walk(row)
+
+
+def _walk(row: Mapping[str, Any]) -> str:
+    return f"{row['walk']} of {row['seeds']}"
 
 
 def _last_tests(call: Call, trainer: str) -> Iterator[str]:
