@@ -64,6 +64,12 @@ def report(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "pack.json").read_text())
 
 
+def state_of(folder: Path) -> str | None:
+    """That of the only job, as the pack last wrote it."""
+    jobs = report(folder)["jobs"] if (folder / "pack.json").exists() else []
+    return jobs[0]["state"] if jobs else None
+
+
 def running_in(folder: Path) -> list[str]:
     """Commands of processes that name the folder."""
     found = []
@@ -282,6 +288,8 @@ def test_a_killed_pack_leaves_nothing_of_a_group_whose_leader_has_ended(
         )
         child = identify(int((tmp_path / "child").read_text()))
         assert child is not None
+        # A janitor knows of no process before the pack has it.
+        wait_until(lambda: state_of(tmp_path / "all") == "running", 60.0, "the pack has it")
         if ends == "before the pack":
             wait_until(lambda: not leader.exists(), 10.0, "the leader has ended")
             time.sleep(0.5)  # The pack has told its janitor.

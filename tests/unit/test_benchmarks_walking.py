@@ -342,6 +342,7 @@ def test_a_call_with_fewer_seeds_does_not_take_the_place_of_one_with_more(tmp_pa
     rows = [f"| {SAC} | {CACHED} | {WALK} | 70 {MOST} |  | {SHARE} | 0.07 |  |"]
     assert _rows_of_the_table() == rows
     median, seeds = seconds_until_it_walks("go1", "warp")
+    assert median is not None
     assert (median.median, seeds) == (70.0, "5 of 5")
     # Playground's script is compared with ours of the same call.
     _add_call(tmp_path, 60.0, by_sac, seeds=2, script=True)
