@@ -102,6 +102,12 @@ COMPARISONS: Mapping[str, Comparison] = MappingProxyType(
                 *("tuned=locomotion_ppo", "num_timesteps=5000000"),
             )
         ),
+        "Playground's G1JoystickFlatTerrain": Comparison(
+            (
+                *("env=playground", "env.name=G1JoystickFlatTerrain", "physics.impl=warp"),
+                *("tuned=g1_ppo", "num_timesteps=5000000"),
+            )
+        ),
         # The nearest that there is: walking to a commanded velocity on flat ground.
         "anymal, and mjlab's Go1": Comparison(
             ("env=anymal", "physics.impl=warp", "num_envs=4096", "num_timesteps=10000000"),
