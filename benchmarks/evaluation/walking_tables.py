@@ -17,24 +17,24 @@ from gmijax.sim.robots import robot_name
 Kind: TypeAlias = tuple[str, str, str, str | None, bool]
 """Task or robot, algorithm of our trainings as it is written, physics, GPU, and start."""
 
+FoundCall: TypeAlias = tuple[Call, Path]
 
-def _calls() -> dict[tuple[Kind, bool], tuple[Call, Path]]:
+_FILES = "walking-*-nvidia-*.json"
+
+
+def _calls() -> dict[tuple[Kind, bool], FoundCall]:
     """Of each kind the call with the most seeds, and one with Playground's script besides."""
-    most, with_script = _with_most_seeds(), _with_most_seeds(needs_script=True)
-    more = {(kind, True): call for kind, call in with_script.items() if call != most[kind]}
-    return {(kind, False): call for kind, call in most.items()} | more
+    known = calls_by_date(_FILES)
+    most = _with_most_seeds(known)
+    with_script = _with_most_seeds([one for one in known if SCRIPT in one[0].results["rows"]])
+    more = {(kind, True): one for kind, one in with_script.items() if one != most[kind]}
+    return {(kind, False): one for kind, one in most.items()} | more
 
 
-def _with_most_seeds(*, needs_script: bool = False) -> dict[Kind, tuple[Call, Path]]:
+def _with_most_seeds(known: Sequence[FoundCall]) -> dict[Kind, FoundCall]:
     """Of each kind the call with the most seeds of ours; of those the newest."""
-    found: dict[Kind, tuple[Call, Path]] = {}
-    for call, path in calls_by_date("walking-*-nvidia-*.json"):
-        if needs_script and SCRIPT not in call.results["rows"]:
-            continue
-        before = found.get(kind := _kind_of(call))
-        if before is None or _seeds(before[0]) <= _seeds(call):
-            found[kind] = call, path
-    return found
+    ascending = sorted(known, key=lambda one: one[0].results["rows"][OURS]["seeds"])
+    return {_kind_of(call): (call, path) for call, path in ascending}
 
 
 def _kind_of(call: Call) -> Kind:
@@ -44,10 +44,6 @@ def _kind_of(call: Call) -> Kind:
     task = call.results["task"]
     robot = robot_name(task.removeprefix("playground/"))
     return robot or task, algo, _physics(call, OURS), call.device, call.settings["cold"]
-
-
-def _seeds(call: Call) -> int:
-    return int(call.results["rows"][OURS]["seeds"])
 
 
 @table_of_calls(
@@ -86,7 +82,7 @@ def _tests_of(call: Call, trainer: str) -> list[list[Mapping[str, Any]]]:
 def seconds_until_it_walks(task: str, impl: str) -> tuple[Figure | None, str]:
     """By SAC with the most seeds, compiled before: seconds of training, and how many walk."""
     wanted = (task, "SAC", impl, False)
-    calls = _with_most_seeds()
+    calls = _with_most_seeds(calls_by_date(_FILES))
     found = next((calls[kind] for kind in calls if (*kind[:3], kind[4]) == wanted), None)
     if found is None:
         return None, NOT_MEASURED
