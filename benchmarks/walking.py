@@ -1,7 +1,8 @@
 r"""Seconds until a robot walks: `python -m benchmarks.walking env=go1 --seeds 5`.
 
 Trains with checkpoints on the way, then puts them through the walking test, so that no test costs
-training time. A training walks from the first checkpoint on of which two in a row walk. Its
+training time. A training walks from the first checkpoint on of which two in a row walk; one whose
+tests were cut short by `--deadline-s` counts neither as walking nor as not. Its
 seconds run from the start of the command until the checkpoint is written, and apart from that from
 the first step until the policy is there. Programs, and kernels of MJX-Warp, are compiled before,
 in a short training; with `--cold` every training, and the tests, compile all of them.
@@ -197,13 +198,12 @@ class Benchmark:
         return script_flags(shlex.split(self._given.script)).impl
 
     def _write(self) -> None:
-        rows = summary(self.runs)
         runs = [
             {**run, "checkpoints": [_without_folder(one) for one in run["checkpoints"]]}
             for run in sorted(self.runs, key=lambda run: run["seed"])
         ]
         with self.file.changing() as results:
-            results.update(task=self._config.env.label, rows=rows, runs=runs)
+            results.update(task=self._config.env.label, runs=runs)
 
 
 def script_flags(given: Sequence[str]) -> argparse.Namespace:
@@ -236,11 +236,19 @@ def _without_folder(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in checkpoint.items() if key != "folder"}
 
 
+def is_tested(run: Mapping[str, Any]) -> bool:
+    """Whether it is known of a training if it walks: the deadline may have ended its tests."""
+    return bool(run.get("walks_from")) or all("walk" in one for one in run["checkpoints"])
+
+
 def summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Of each trainer: how many trainings walk, and least, median and most of when they do."""
+    """Of each trainer: how many trainings walk, and least, median and most of when they do.
+
+    `seeds` are those that are tested.
+    """
     rows: dict[str, Any] = {}
     for trainer in dict.fromkeys(run["trainer"] for run in runs):
-        mine = [run for run in runs if run["trainer"] == trainer]
+        mine = [run for run in runs if run["trainer"] == trainer and is_tested(run)]
         walking = [run["walks_from"] for run in mine if run.get("walks_from")]
         spread = {
             key: _spread([one[key] for one in walking])

@@ -11,7 +11,7 @@ from benchmarks.evaluation.evidence import source
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure
 from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
 from benchmarks.records import Call, calls_by_date
-from benchmarks.walking import OURS, SCRIPT
+from benchmarks.walking import OURS, SCRIPT, is_tested, summary
 from gmijax.sim.robots import robot_name
 
 Kind: TypeAlias = tuple[str, str, str, str | None, bool]
@@ -26,15 +26,20 @@ def _calls() -> dict[tuple[Kind, bool], FoundCall]:
     """Of each kind the call with the most seeds, and one with Playground's script besides."""
     known = calls_by_date(_FILES)
     most = _with_most_seeds(known)
-    with_script = _with_most_seeds([one for one in known if SCRIPT in one[0].results["rows"]])
+    with_script = _with_most_seeds([one for one in known if SCRIPT in _rows(one[0])])
     more = {(kind, True): one for kind, one in with_script.items() if one != most[kind]}
     return {(kind, False): one for kind, one in most.items()} | more
 
 
 def _with_most_seeds(known: Sequence[FoundCall]) -> dict[Kind, FoundCall]:
     """Of each kind the call with the most seeds of ours; of those the newest."""
-    ascending = sorted(known, key=lambda one: one[0].results["rows"][OURS]["seeds"])
+    ascending = sorted(known, key=lambda one: _rows(one[0])[OURS]["seeds"])
     return {_kind_of(call): (call, path) for call, path in ascending}
+
+
+def _rows(call: Call) -> dict[str, Any]:
+    """When those of each trainer walk."""
+    return summary(call.results["runs"])
 
 
 def _kind_of(call: Call) -> Kind:
@@ -57,7 +62,7 @@ def walking(calls: Calls) -> Rows:
     """How long robots are trained until they walk: median, least and most of seeds."""
     for ((task, algo, _, _, is_cold), _), (call, _) in sorted(calls.items()):
         start = "compiled anew" if is_cold else "from the cache"
-        for trainer, row in call.results["rows"].items():
+        for trainer, row in _rows(call).items():
             name = trainer if trainer == SCRIPT else f"{trainer} {algo}"
             spreads = (
                 _spread(row["env_steps"], 1e-6),
@@ -69,14 +74,15 @@ def walking(calls: Calls) -> Rows:
 
 def _physics(call: Call, trainer: str) -> str:
     """The MJX implementation that this trainer's policies were trained and tested with."""
-    found = (one["walk"]["impl"] for tests in _tests_of(call, trainer) for one in tests)
-    return next(found, "")
+    runs = [run for run in call.results["runs"] if run["trainer"] == trainer]
+    tests = (one["walk"] for run in runs for one in run["checkpoints"] if "walk" in one)
+    return next((test["impl"] for test in tests), "")
 
 
 def _tests_of(call: Call, trainer: str) -> list[list[Mapping[str, Any]]]:
-    """The tested checkpoints of every training."""
-    runs = [run["checkpoints"] for run in call.results["runs"] if run["trainer"] == trainer]
-    return [[one for one in checkpoints if "walk" in one] for checkpoints in runs]
+    """The tested checkpoints of every training whose tests came to their end."""
+    runs = [run for run in call.results["runs"] if run["trainer"] == trainer and is_tested(run)]
+    return [[one for one in run["checkpoints"] if "walk" in one] for run in runs]
 
 
 def seconds_until_it_walks(task: str, impl: str) -> tuple[Figure | None, str]:
@@ -87,7 +93,7 @@ def seconds_until_it_walks(task: str, impl: str) -> tuple[Figure | None, str]:
     if found is None:
         return None, NOT_MEASURED
     call, path = found
-    row = call.results["rows"][OURS]
+    row = _rows(call)[OURS]
     if row["training_s"] is None:
         return None, _walk(row)
     low, median, high = row["training_s"]

@@ -155,7 +155,7 @@ def test_every_seed_is_trained_and_tested_on_a_gpu_of_its_own(tmp_path, monkeypa
     (call,) = read_calls(path)
     assert call.device == "1 x some GPU"
     assert [run["seed"] for run in call.results["runs"]] == [0, 1, 2, 3, 4]
-    assert call.results["rows"]["gmijax"]["walk"] == 5
+    assert summary(call.results["runs"])["gmijax"]["walk"] == 5
 
 
 def test_tests_end_with_the_second_in_a_row_that_walks():
@@ -163,12 +163,24 @@ def test_tests_end_with_the_second_in_a_row_that_walks():
     assert [walks_twice(walks[:n]) for n in range(1, 5)] == [False, False, False, True]
 
 
+def _run_of(trainer, tested):
+    return {"trainer": trainer, "walks_from": walks_from(tested), "checkpoints": tested}
+
+
+def test_a_training_whose_tests_were_cut_short_counts_neither_way():
+    cut = [_run_of("gmijax", checkpoints(*walks)) for walks in ((False, None), (None,))]
+    tested = _run_of("gmijax", checkpoints(False, False))
+    row = summary([*cut, tested])["gmijax"]
+    assert (row["seeds"], row["walk"]) == (1, 0)
+    assert summary(cut)["gmijax"]["seeds"] == 0
+
+
 def test_summary_has_least_median_and_most_of_those_that_walk():
     runs = [
-        {"trainer": "gmijax", "walks_from": walks_from(checkpoints(*walks))}
-        for walks in ((True, True), (False, True, True), (False, True), (True, True))
+        _run_of("gmijax", checkpoints(*walks))
+        for walks in ((True, True), (False, True, True), (False, True), (True, True, None))
     ]
-    row = summary([*runs, {"trainer": "train-jax-ppo"}])
+    row = summary([*runs, _run_of("train-jax-ppo", [])])
     assert row["gmijax"] == {
         "seeds": 4,
         "walk": 3,
@@ -296,15 +308,22 @@ def _add_call(folder, seconds, given, *, task="go1", is_cold=False, seeds=5, scr
     """A call of a walking benchmark, as if it had been measured."""
     settings = {"cold": is_cold, "overrides": given}
     file = ResultsFile(folder / "walking-go1-nvidia-h100.json", "walking", settings, device="H100")
-    spread = {"training_s": [50.0, seconds, 120.0], "command_s": None}
-    row = {"seeds": seeds, "walk": seeds, "env_steps": [4e7, 5e7, 6e7], **spread}
     errors = {"linear_m_per_s": seconds / 1000, "yaw_rad_per_s": None}
     walk = {"upright": 0.995, "settled": errors, "impl": "warp"}
     tests = [{"env_steps": 7e7, "walk": walk}, {"env_steps": 8e7}]
-    trainers = {"gmijax": row} | ({SCRIPT: row | {"seeds": 1, "walk": 0}} if script else {})
-    runs = [{"trainer": trainer, "checkpoints": tests} for trainer in trainers] * seeds
+    middle = [(5e7, seconds)] * (seeds - 2)
+    runs = [
+        {
+            "trainer": "gmijax",
+            "checkpoints": tests,
+            "walks_from": {"env_steps": steps, "training_s": at_s, "command_s": None},
+        }
+        for steps, at_s in [(4e7, 50.0), *middle, (6e7, 120.0)]
+    ]
+    cut = {"trainer": "gmijax", "checkpoints": tests[1:]}  # No time was left for its tests.
+    by_script = [{"trainer": SCRIPT, "checkpoints": tests[:1]}] if script else []
     with file.changing() as results:
-        results.update(task=task, rows=trainers, runs=runs)
+        results.update(task=task, runs=[*runs, cut, *by_script])
 
 
 def _rows_of_the_table():
@@ -338,24 +357,24 @@ def test_a_call_with_fewer_seeds_does_not_take_the_place_of_one_with_more(tmp_pa
     monkeypatch.setattr(records, "RESULTS", tmp_path)
     by_sac = ["env=go1", "algo=sac"]
     _add_call(tmp_path, 70.0, by_sac)
-    _add_call(tmp_path, 50.0, by_sac, seeds=2)
+    _add_call(tmp_path, 50.0, by_sac, seeds=3)
     rows = [f"| {SAC} | {CACHED} | {WALK} | 70 {MOST} |  | {SHARE} | 0.07 |  |"]
     assert _rows_of_the_table() == rows
     median, seeds = seconds_until_it_walks("go1", "warp")
     assert median is not None
     assert (median.median, seeds) == (70.0, "5 of 5")
     # Playground's script is compared with ours of the same call.
-    _add_call(tmp_path, 60.0, by_sac, seeds=2, script=True)
-    few, script = WALK.replace("5 of 5", "2 of 2"), WALK.replace("5 of 5", "0 of 1")
+    _add_call(tmp_path, 60.0, by_sac, seeds=3, script=True)
+    few = WALK.replace("5 of 5", "3 of 3")
     beside = [
         f"| {SAC} | {CACHED} | {few} | 60 {MOST} |  | {SHARE} | 0.06 |  |",
-        f"| `go1` | warp | {SCRIPT} | {CACHED} | {script} | 60 {MOST} |  | {SHARE} | 0.06 |  |",
+        f"| `go1` | warp | {SCRIPT} | {CACHED} | 0 of 1 |  |  |  | {SHARE} | 0.06 |  |",
     ]
     assert _rows_of_the_table() == [*rows, *beside]
     assert seconds_until_it_walks("go1", "warp")[1] == "5 of 5"
     # One with as many seeds says it all.
     _add_call(tmp_path, 60.0, by_sac, script=True)
-    whole = [line.replace("2 of 2", "5 of 5") for line in beside]
+    whole = [line.replace("3 of 3", "5 of 5") for line in beside]
     assert _rows_of_the_table() == whole
 
 
@@ -449,9 +468,9 @@ def test_a_call_trains_tests_and_writes_what_it_found(
     assert theirs[0][-2:] == ["--num_timesteps=50000000", "--num_evals=2"]
     (path,) = tmp_path.glob("walking-go1-*.json")
     (call,) = read_calls(path)
-    rows = call.results["rows"]
+    rows = summary(call.results["runs"])
     assert "folder" not in call.results["runs"][0]["checkpoints"][0]
-    assert (rows["gmijax"]["walk"], rows["gmijax"]["seeds"]) == (2 if works else 0, 2)
+    assert (rows["gmijax"]["walk"], rows["gmijax"]["seeds"]) == ((2, 2) if works else (0, 0))
     assert rows["gmijax"]["training_s"] == ([20.0, 20.0, 20.0] if works else None)
     assert rows["train-jax-ppo"]["walk"] == 0
     assert not list(tmp_path.rglob("gmi_0"))
