@@ -10,7 +10,12 @@ from typing import Any, NamedTuple
 from gmijax.config import EnvConfig, TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.partition.plan import Plan
-from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of, newest_checkpoint
+from gmijax.runs.checkpoints import (
+    CheckpointMeta,
+    checkpoints_of,
+    newest_checkpoint,
+    none_is_whole,
+)
 from gmijax.runs.folder import (
     NO_RUN_FOLDER,
     RUNS,
@@ -119,6 +124,11 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
         )
     require_known_keys(saved, shown)
     found = newest_checkpoint(folder)
+    if found.checkpoint is None and found.passed_over:
+        raise ConfigError(
+            f"{shown}: {none_is_whole(found)}; to train anew, choose another run.dir or remove "
+            f"{run.checkpoints}"
+        )
     changes = differences(saved, config).values()
     notes = (*found.passed_over, *(f"changed since the run: {text}" for text in changes))
     if found.checkpoint is None:

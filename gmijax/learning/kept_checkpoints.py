@@ -7,6 +7,7 @@ import os
 import shutil
 from pathlib import Path
 
+from gmijax.errors import ConfigError
 from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of
 from gmijax.runs.folder import META, RunPaths, replays_of, write_json
 from gmijax.runs.ranking import ranked
@@ -29,8 +30,11 @@ def keep_last_replays(paths: RunPaths, last: Path) -> None:
         replays = replays_of(checkpoint)
         if checkpoint == last or not replays:
             continue
+        try:
+            meta = CheckpointMeta.read(checkpoint)
+        except ConfigError:  # A damaged one, which whoever wants to continue is told of.
+            continue
         # First the list of files, so that it is a whole checkpoint at any time.
-        meta = CheckpointMeta.read(checkpoint)
         names = {path.name for path in replays}
         files = {
             name: check for name, check in meta.files.items() if name.split("/")[0] not in names

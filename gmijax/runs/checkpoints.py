@@ -98,8 +98,7 @@ def checkpoints_of(folder: Path) -> list[Path]:
 
     What has another name than gmijax gives is somebody's copy, and none of them.
     """
-    found = by_steps(RunPaths(folder).checkpoints)
-    return [path for path in found if os.path.lexists(path / META)]
+    return by_steps(RunPaths(folder).checkpoints)
 
 
 def drop_unfinished(run: RunPaths) -> None:
@@ -118,6 +117,13 @@ def newest_checkpoint(folder: Path) -> NewestCheckpoint:
             return NewestCheckpoint(checkpoint.resolve(), tuple(passed_over))
         passed_over.append(f"checkpoint {checkpoint}: passed over, {wrong}")
     return NewestCheckpoint(None, tuple(passed_over))
+
+
+def none_is_whole(found: NewestCheckpoint) -> str:
+    """Says so, with what is wrong with the newest one; there are some."""
+    newest, *others = found.passed_over
+    more = f" (and {len(others)} more)" if others else ""
+    return f"no checkpoint is whole: {newest.removeprefix('checkpoint ')}{more}"
 
 
 def what_is_broken(checkpoint: Path) -> str | None:

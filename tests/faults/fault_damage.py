@@ -8,15 +8,21 @@ import random
 import shutil
 from pathlib import Path
 
-from fault_checks import checkpoints_of
+from fault_checks import checkpoints_of, is_whole
 
 _COPIES = ("2099-11-26-good", "{}.mine", "9{}", "{} (1)", "\u0660" * 12)
 """Names of copies, after that of the checkpoint: by hand, by a file manager, in other digits."""
 
 
-def damage_checkpoint(checkpoint: Path | None, kind: str) -> None:
-    """Damages a checkpoint, as its kind of fault says."""
-    assert checkpoint is not None, "there is none to damage"
+def damage_checkpoint(run: Path, kind: str) -> None:
+    """Damages the newest whole checkpoint, as its kind of fault says.
+
+    Not the only one: a run without a whole one is refused.
+    """
+    whole = [path for path in checkpoints_of(run) if is_whole(path)]
+    if len(whole) < 2:
+        return
+    checkpoint = whole[-1]
     meta = checkpoint / "meta.json"
     files = [path for path in checkpoint.rglob("*") if path.is_file() and path != meta]
     largest = max(files, key=lambda path: path.stat().st_size)

@@ -200,4 +200,4 @@ class _Job:
         elif kind == "checkpoint_copies":
             self._copies |= add_copies(self._run)
         elif kind.startswith("checkpoint_"):
-            damage_checkpoint(newest_whole(self._run), kind)
+            damage_checkpoint(self._run, kind)

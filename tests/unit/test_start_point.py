@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -72,6 +73,29 @@ def test_auto_goes_on_from_the_newest_checkpoint_that_is_whole(run: RunPaths):
     assert beginning[:3] == (run, run.checkpoint(100), False)
     assert "000000000200: passed over" in beginning.notes[0]
     assert find_start_point(config_of(run.root, "num_timesteps=100")).is_complete
+
+
+@pytest.mark.parametrize("damage", ["cut", "missing"])
+def test_auto_refuses_a_run_of_which_no_checkpoint_is_whole(run: RunPaths, damage: str):
+    for steps in (100, 200):
+        meta = save(run, steps) / META
+        if damage == "missing":
+            meta.unlink()
+        else:
+            meta.write_text("{")
+    wrong = r"no checkpoint is whole: .*/000000000200: passed over, .*meta.json.* \(and 1 more\)"
+    advice = f"; to train anew, choose another run.dir or remove {run.checkpoints}"
+    with pytest.raises(ConfigError, match=f"^run.resume=auto: {run.root}: {wrong}{advice}$"):
+        find_start_point(config_of(run.root))
+    shutil.rmtree(run.checkpoints)
+    assert find_start_point(config_of(run.root))[:2] == (run, None)
+
+
+def test_a_file_in_place_of_the_checkpoints_is_found_before_anything_is_trained(run: RunPaths):
+    run.checkpoints.parent.mkdir(exist_ok=True)
+    run.checkpoints.write_text("")
+    with pytest.raises(ConfigError, match=r"/checkpoints: cannot be read \(Not a directory\)$"):
+        find_start_point(config_of(run.root))
 
 
 def test_auto_refuses_the_folder_of_another_task(run: RunPaths):
