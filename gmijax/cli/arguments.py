@@ -120,6 +120,8 @@ def _unreadable(text: str, error: HydraException) -> ConfigError:
     key, _, value = text.partition("=")
     if not value or not re.fullmatch(r"[\w.+~/@:$-]+", key, re.ASCII):
         return ConfigError(f"{text}: expected key=value")
+    if not all(key.lstrip("+~").split("@")[0].split(".")):
+        return ConfigError(f"{text}: expected a name before and after every dot of {key}")
     if function := re.search(r"while evaluating .*", str(error)):
         return ConfigError(f"{text}: {function[0]}")
     text_of_it = f"{key}={quoted(value)}"

@@ -31,7 +31,8 @@ def doc(
 ) -> Any:
     """A dataclass field whose meaning `--help` prints; one with a default may be left out.
 
-    `KeyGroup` checks its limits: at least `low`, at most `high`, or greater than 0.
+    `KeyGroup` checks its limits: at least `low`, at most `high`, or greater than 0. A text that
+    may not be null may not be empty either.
     """
     limits = (low, high, positive)
     return dataclasses.field(metadata={"doc": text, "limits": limits}, default=default)
@@ -45,6 +46,8 @@ class KeyGroup:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(typing.cast("Any", self)):
             limits, found = field.metadata.get("limits"), getattr(self, field.name)
+            if field.type == "str" and not found.strip():
+                raise ConfigError(f"{self.prefix}{field.name}={found}: must not be empty")
             for value in found if isinstance(found, tuple) else (found,):
                 if limits and isinstance(value, int | float):
                     _require_limits(f"{self.prefix}{field.name}", value, *limits)

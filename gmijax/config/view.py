@@ -29,8 +29,6 @@ class PageConfig(KeyGroup):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.host:  # It would stand for all addresses.
-            raise ConfigError("view.host: expected an address, e.g. 127.0.0.1")
         for origin in self.allow_origin:
             if origin_of(origin) != origin:
                 raise ConfigError(

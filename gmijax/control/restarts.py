@@ -177,6 +177,10 @@ def why_not_again(error: GmiFailed, last: GmiFailed | None) -> str | None:
     if error.is_final:
         return "the last attempt left something behind, or nothing can be started"
     if (reported := error.error) is None:
+        # A library has ended the process, e.g. for an unknown flag. Signals may be of outside.
+        ends = [(one.error, one.exit_code, one.iteration) for one in (last, error) if one]
+        if error.exit_code > 0 and ends[1:] and ends[0] == ends[1]:
+            return f"exit code {error.exit_code} at the same iteration ({error.iteration}) twice"
         return None
     if reported.type in _LASTING:
         return f"{reported.type} would happen again"

@@ -50,7 +50,10 @@ class JobEvents:
             before = self._stages.get(job.number, ("waiting", 0, None))
             self._stages[job.number] = now
             if now != before:
-                self._changed(job, now[0])
+                if now[0] == "running" or now[1] > before[1]:  # It may have ended since.
+                    self._started(job)
+                if now[0] != "running":
+                    self._stopped(job, now[0])
             elif is_due and now[0] == "running":
                 self._progress(job)
         if is_due:
@@ -62,13 +65,13 @@ class JobEvents:
         found = {key: report.get(key) for key in ("status", "ranking", "settings", "wall_s")}
         self._write(f"{self._name}_ended", **found)
 
-    def _changed(self, job: AnyJob, state: str) -> None:
+    def _started(self, job: AnyJob) -> None:
+        slot = job.progress.slot or None
+        more = {"attempt": job.progress.attempts, "note": job.progress.note}
+        self._write("job_started", job, overrides=dict(job.overrides), slot=slot, **more)
+
+    def _stopped(self, job: AnyJob, state: str) -> None:
         progress = job.progress
-        if state == "running":
-            slot = progress.slot or None
-            more = {"attempt": progress.attempts, "note": progress.note}
-            self._write("job_started", job, overrides=dict(job.overrides), slot=slot, **more)
-            return
         event = "job_ended" if state in _ENDS else "job_waits"
         error, log = progress.error, str(self._paths.log(job.number))
         ends = {"exit_code": progress.exit_code, "error": error, "log": log}

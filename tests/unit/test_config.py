@@ -36,6 +36,13 @@ def test_numbers_are_finite():
             from_dict(TrainConfig, data)
 
 
+@pytest.mark.parametrize("key", ["cluster.address", "wandb.project"])
+def test_a_text_that_is_not_null_is_not_empty(key: str):
+    for given in ("", "' '"):
+        with pytest.raises(ConfigError, match=rf"^{key}=\s?: must not be empty$"):
+            compose(f"{key}={given}")
+
+
 @pytest.mark.parametrize("rate", [9e-6, 0.011])
 def test_adaptive_learning_rate_begins_where_it_is_kept(rate: float):
     algo = compose("algo.learning_rate_schedule=adaptive_kl").algo

@@ -160,6 +160,19 @@ def test_the_same_error_at_the_same_iteration_ends_the_job(job: Job):
         assert why_not_again(other, error()) is None
 
 
+def test_a_process_that_ends_itself_at_the_same_iteration_twice_ends_the_job(job: Job):
+    def ended(code: int, iteration: int = 0) -> GmiFailed:
+        return GmiFailed(0, f"exit code {code}", iteration=iteration, exit_code=code)
+
+    said = job.gives_up(*[job.dies(why=ended(1))] * 2, fine)
+    assert "exit code 1 at the same iteration (0) twice" in said
+    assert len(job.attempts.restarts) == 1
+    for other in (ended(2), ended(1, iteration=4), ended(-6), error(iteration=0)):
+        assert why_not_again(other, ended(1)) is None
+    assert why_not_again(ended(-6), ended(-6)) is None
+    assert why_not_again(ended(1), None) is None
+
+
 def test_a_failure_while_the_job_stops_is_not_tried_again(job: Job):
     def stop_and_fail(signals: StopSignals) -> None:
         signals.handle(signal.SIGTERM)

@@ -1,0 +1,55 @@
+"""What programs read of jobs: every start and every end, however short a job is."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from gmijax.sweeps.events import JobEvents
+from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.progress import Progress
+
+
+def events_of(progress: Progress, *changes: dict[str, Any]) -> list[tuple[str, Any]]:
+    """Names of the events with the attempt, where that is told; each change is seen once."""
+    stream = io.StringIO()
+    job: Any = SimpleNamespace(number=0, overrides={}, num_timesteps=None, progress=progress)
+    events = JobEvents(stream, "pack", [job], SweepPaths(Path("all")))
+    for change in changes:
+        for name, value in change.items():
+            setattr(progress, name, value)
+        events.update()
+    told = map(json.loads, stream.getvalue().splitlines())
+    return [(event["event"], event.get("attempt")) for event in told][1:]
+
+
+def test_a_job_that_ended_before_anybody_looked_has_started():
+    short = events_of(Progress(), {"state": "completed", "attempts": 1})
+    assert short == [("job_started", 1), ("job_ended", None)]
+    failed = events_of(Progress(), {"state": "failed", "attempts": 1}, {})
+    assert failed == [("job_started", 1), ("job_ended", None)]
+
+
+def test_a_job_starts_once_in_each_attempt():
+    running = {"state": "running", "attempts": 1}
+    again = {"state": "running", "attempts": 2}
+    waits = {"state": "waiting", "note": "no slot is free"}
+    assert events_of(Progress(), running, {}, waits, again, {"state": "completed"}) == [
+        ("job_started", 1),
+        ("job_waits", None),
+        ("job_started", 2),
+        ("job_ended", None),
+    ]
+    # Both attempts were over before anybody looked.
+    assert events_of(Progress(), running, {"state": "failed", "attempts": 2}) == [
+        ("job_started", 1),
+        ("job_started", 2),
+        ("job_ended", None),
+    ]
+
+
+def test_a_job_that_was_never_started_ends_without_a_start():
+    assert events_of(Progress(), {"state": "interrupted"}) == [("job_ended", None)]
