@@ -16,7 +16,7 @@ from gmijax.learning.physics_health import (
     check_losses,
     overflow_line,
 )
-from gmijax.runs.folder import RunPaths
+from gmijax.runs.folder import RunPaths, naming
 from gmijax.runs.history import read_metrics, scalars
 from gmijax.runs.tensorboard import Event, EventsWriter, Summary
 
@@ -27,11 +27,12 @@ class JsonlSink:
     """Appends one JSON object a line; None stands for a number that is not there yet."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("a", buffering=1)
+        self._path, self._file = path, path.open("a", buffering=1)
 
     def write(self, line: Line) -> None:
         """Takes one iteration's metrics."""
-        self._file.write(json.dumps({k: _finite(v) for k, v in line.items()}) + "\n")
+        with naming(self._path):
+            self._file.write(json.dumps({k: _finite(v) for k, v in line.items()}) + "\n")
 
     def close(self) -> None:
         """No write may follow."""

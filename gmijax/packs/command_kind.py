@@ -23,7 +23,7 @@ from gmijax.packs.output import OutputReader
 from gmijax.packs.progress import ProgressReader, own_patterns
 from gmijax.packs.recorder import Recorder, mark_of
 from gmijax.packs.template import fill
-from gmijax.runs.folder import RunPaths, write_json
+from gmijax.runs.folder import RunPaths, naming, write_json
 from gmijax.sweeps.children import ChildStatus, Process
 from gmijax.sweeps.kind import JobStart
 from gmijax.sweeps.paths import ENV_PACK_DIR, SweepPaths
@@ -111,7 +111,7 @@ class CommandKind:
             run.metrics.unlink(missing_ok=True)
         more = shlex.split(settings.resume or "") if resumes else []
         arguments = job.arguments(run_dir, more)
-        with log.open("a") as file:
+        with naming(log), log.open("a") as file:
             file.write(f"$ {shlex.join(arguments)}\n")
         at_once = 1 if slot.is_alone else self._at_once(slot)
         process = Process(

@@ -6,12 +6,14 @@ import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from supervision import machine, planned
 
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.errors import GmiFailed, GmijaxError, JobInterrupted
+from gmijax.learning.training_log import JsonlSink
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.supervise.run_gmis import recorded
 
@@ -48,6 +50,24 @@ def test_the_file_that_was_to_be_written_is_named(
     assert exit_code_of("train", lambda: write_json(folder, {})) == 2
     assert capsys.readouterr().err == f"gmijax.train: {folder}: Is a directory\n"
     assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_a_file_that_was_open_when_the_disk_was_full_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def no_space(_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", no_space)
+    plan, metrics = tmp_path / "plan.json", tmp_path / "metrics.jsonl"
+    sink = JsonlSink(metrics)
+    sink.close()
+    monkeypatch.setattr(sink, "_file", SimpleNamespace(write=no_space))
+    for path, write in ((plan, lambda: write_json(plan, {})), (metrics, lambda: sink.write({}))):
+        assert exit_code_of("train", write) == 1
+        full = os.strerror(errno.ENOSPC)
+        assert capsys.readouterr().err == f"gmijax.train: {path}: {full}\n"
+    assert list(tmp_path.iterdir()) == [metrics]
 
 
 def test_other_errors_of_files_are_not_hidden() -> None:
