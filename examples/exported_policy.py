@@ -17,6 +17,7 @@ import onnxruntime
 
 MODEL = Path(__file__).parents[1] / "gmijax" / "sim" / "assets" / "ball_balance.xml"
 STEPS, SUBSTEPS, SPEED = 500, 2, 20.0  # Of an episode, per action; rad/s of an action of 1.
+SIZES = 24, 3  # Of an observation and an action.
 KNEES, BALL = [f"knee_{leg}" for leg in (1, 2, 3)], "ball"
 
 
@@ -80,6 +81,9 @@ def episode(
 def main(path: str, *options: str) -> None:
     """Prints the mean return of 64 episodes, or shows episodes until the window is closed."""
     policy = onnxruntime.InferenceSession(path)
+    sizes = policy.get_inputs()[0].shape[1], policy.get_outputs()[0].shape[1]
+    if sizes != SIZES:
+        sys.exit(f"{path}: of a task with {sizes} observations and actions, not {SIZES}")
     data = mujoco.MjData(mujoco.MjModel.from_xml_path(str(MODEL)))
     rng = np.random.default_rng(0)
     if "--view" not in options:

@@ -17,6 +17,7 @@ import numpy as np
 
 from gmijax.compile_once import compile_once
 from gmijax.learning.learner import Learner, TrainState, acting_weights
+from gmijax.learning.memory import require_room
 from gmijax.learning.unroll import act, unroll
 from gmijax.player.outcome import Episodes
 from gmijax.sim.divergence import diverged_by_source, end_diverged
@@ -38,6 +39,7 @@ class EpisodeOptions(NamedTuple):
       deterministic: act with the policy's mean instead of sampling.
       max_steps: where episodes are cut off, None for nowhere.
       first_env: number of the first environment, from which its random key comes.
+      key: what sets N.
     """
 
     num_envs: int
@@ -46,6 +48,7 @@ class EpisodeOptions(NamedTuple):
     deterministic: bool
     max_steps: int | None
     first_env: int = 0
+    key: str = "num_envs"
 
 
 class EpisodeRunner:
@@ -67,9 +70,14 @@ class EpisodeRunner:
         self._compile_s = 0.0
 
     def trace(self, state: TrainState) -> None:
-        """Traces the programs; `state` has the shapes of those that will be given to `run`."""
+        """Traces the programs; `state` has the shapes of those that will be given to `run`.
+
+        Raises:
+          ConfigError: so many environments do not fit into memory.
+        """
         started = time.monotonic()
         batch, _ = jax.eval_shape(self._begin, self._model, self._keys)
+        require_room(self._options.key, self._options.num_envs, batch)
         self._begin = self._begin.lower(self._model, self._keys)
         self._chunk = self._chunk.lower(self._model, state, self._step_limit(), batch)
         self._compile_s += time.monotonic() - started

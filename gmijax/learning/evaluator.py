@@ -102,6 +102,7 @@ class Evaluator:
             deterministic=config.eval.deterministic,
             max_steps=None,
             first_env=FIRST_EVAL_ENV + first,
+            key="eval.episodes",
         )
         self._runner = EpisodeRunner(env, learner, options)
         self._films: EpisodeFilms | None = None

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 
 from gmijax.compile_once import compile_once
 from gmijax.config import ServeConfig, TrainConfig
-from gmijax.devices import memory_limit_bytes
 from gmijax.errors import ConfigError
 from gmijax.learning.algorithm import load_algorithm
 from gmijax.learning.checkpoint import (
@@ -24,8 +23,8 @@ from gmijax.learning.checkpoint import (
 )
 from gmijax.learning.episode_window import EpisodeWindow
 from gmijax.learning.learner import Learner, TrainState, init_learner
+from gmijax.learning.memory import in_gib, memory_bytes
 from gmijax.learning.saved_arrays import size_bytes
-from gmijax.machine.host_limits import detect_host
 from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.saved_config import saved_config
 from gmijax.sim.interface import Env
@@ -207,9 +206,9 @@ def begin_episodes(
     env_bytes = num_runs * size_bytes(state)
     all_step_bytes = num_runs * num_envs * step_bytes
     least_bytes = env_bytes + kept_steps * all_step_bytes
-    limit_bytes = _memory_bytes()
+    limit_bytes = memory_bytes()
     if limit_bytes is not None and least_bytes > limit_bytes:
-        need, have = (f"{num_bytes / 2**30:.3g} GiB" for num_bytes in (least_bytes, limit_bytes))
+        need, have = in_gib(least_bytes), in_gib(limit_bytes)
         them = "them" if num_runs == 1 else f"those of {num_runs} runs"
         most_steps = int((limit_bytes - env_bytes) / all_step_bytes)
         most_envs = int(limit_bytes * num_envs / least_bytes)
@@ -222,11 +221,3 @@ def begin_episodes(
         )
     starts = env_keys(key, first_env, num_envs)
     return compile_once(init.lower(env.model, starts))(env.model, starts)
-
-
-def _memory_bytes() -> float | None:
-    """Memory that this process may use for arrays; None where that is unknown."""
-    if jax.local_devices()[0].platform != "cpu":
-        return memory_limit_bytes()
-    host_mib = detect_host().memory_mib
-    return None if host_mib is None else host_mib * 2**20

@@ -197,9 +197,17 @@ def replays_of(checkpoint: Path) -> list[Path]:
 
 
 def given_run(run_dir: str | None, name: str | None) -> Path | None:
-    """The run folder that the user names, None if none."""
+    """The run folder that the user names, None if none.
+
+    Raises:
+      ConfigError: the name leads out of `RUNS`.
+    """
     if run_dir:
         return Path(run_dir)
+    if name and (os.path.isabs(name) or ".." in Path(name).parts):
+        raise ConfigError(
+            f"run.name={name}: expected a name below {RUNS}/; run.dir takes any path"
+        )
     return RUNS / name if name else None
 
 

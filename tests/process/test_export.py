@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 from made_checkpoint import ENV_STEPS, make_run
@@ -109,3 +110,25 @@ def test_the_example_runs_the_policy_in_mujoco(exported: ExportPaths):
         check=True,
     )
     assert done.stdout.startswith("return ")
+
+
+def test_the_example_refuses_the_policy_of_another_task(tmp_path: Path):
+    obs, action = (
+        onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", 60])
+        for name in ("obs", "action")
+    )
+    node = onnx.helper.make_node("Identity", ["obs"], ["action"])
+    graph = onnx.helper.make_graph([node], "other", [obs], [action])
+    made = onnx.helper.make_model(
+        graph, ir_version=8, opset_imports=[onnx.helper.make_opsetid("", 17)]
+    )
+    onnx.save(made, tmp_path / "policy.onnx")
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "examples" / "exported_policy.py"), "policy.onnx"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    said = "policy.onnx: of a task with (60, 60) observations and actions, not (24, 3)\n"
+    assert (done.returncode, done.stderr) == (1, said)

@@ -144,6 +144,8 @@ REFUSED: list[tuple[str, str, str]] = [
     ("view", "view.allow_origin=[hub]", "'hub' is no origin; expected e.g. https://"),
     ("view", "view.host=''", "view.host=: must not be empty"),
     ("train", "algo.=1", "algo.=1: expected a name before and after every dot of algo."),
+    ("train", "run.name=../x", "run.name=../x: expected a name below runs/"),
+    ("serve", "policy=random run.name=/x", "run.name=/x: expected a name below runs/"),
     ("sweep", "run..dir=x", "run..dir=x: expected a name before and after every dot of run..dir"),
     ("view", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
     ("play", "video=avi", "video=avi: expected one of auto, mp4"),

@@ -9,7 +9,7 @@ import pytest
 from toy_env import walker
 
 from gmijax.errors import ConfigError
-from gmijax.learning import start
+from gmijax.learning import memory, start
 from gmijax.machine.host_limits import HostLimits
 from gmijax.sim.wrappers import BatchState, env_keys, training_env
 
@@ -38,7 +38,7 @@ def test_more_environments_than_memory_holds_are_refused_before_there_is_one(
 
 
 def test_what_fits_is_told_and_is_taken(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(start, "detect_host", lambda: HostLimits(memory_mib=1))
+    monkeypatch.setattr(memory, "detect_host", lambda: HostLimits(memory_mib=1))
     with pytest.raises(ConfigError, match=r"allowed: .*num_envs less than") as refused:
         begin(10**6)
     most = int(str(refused.value).rpartition(" ")[2])
@@ -53,7 +53,7 @@ def test_what_fits_is_told_and_is_taken(monkeypatch: pytest.MonkeyPatch):
         begin(8, kept_steps=10**9)  # Not even one environment could have so many.
     with pytest.raises(ConfigError, match="allowed: less of both num_envs and unroll_length"):
         begin(10**6, kept_steps=10**9)
-    monkeypatch.setattr(start, "detect_host", HostLimits)  # Unknown.
+    monkeypatch.setattr(memory, "detect_host", HostLimits)  # Unknown.
     begin(most + 1)
 
 

@@ -11,6 +11,8 @@ import pytest
 
 from gmijax.cli.compose import compose
 from gmijax.config import AlgoConfig
+from gmijax.errors import ConfigError
+from gmijax.learning import memory
 from gmijax.learning.episodes import CHUNK_STEPS, EpisodeOptions, Episodes, run_episodes
 from gmijax.learning.learner import init_learner, make_learner
 from gmijax.sim import episode
@@ -64,6 +66,15 @@ def episodes_of(algo: AlgoConfig, env: Env, **changes: object):
 @pytest.fixture(scope="module")
 def played(algo: AlgoConfig) -> Episodes:
     return episodes_of(algo, counting_env())
+
+
+def test_more_environments_than_memory_holds_are_refused_before_they_are_made(
+    algo: AlgoConfig, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(memory, "memory_bytes", lambda: 64.0)
+    wrong = r"^eval\.episodes: 8 environments in one process .*; at most \d fit"
+    with pytest.raises(ConfigError, match=wrong):
+        episodes_of(algo, counting_env(), key="eval.episodes")
 
 
 def test_every_environment_plays_one_episode_and_no_more(played: Episodes):
