@@ -1,61 +1,206 @@
-"""Which kernels of MuJoCo Warp are compiled at once, and where."""
+"""Which kernels of MuJoCo Warp are compiled at once, and where; Warp is faked."""
 
 from __future__ import annotations
 
 import os
-import sys
-from pathlib import Path
-from types import ModuleType
+import threading
+from contextlib import nullcontext
+from types import SimpleNamespace
 from typing import Any
 
 import jax
-import mujoco.mjx
+import mujoco
+import numpy as np
 import pytest
 
-from gmijax.sim.warp.kernels import PACKAGE, compile_kernels, modules_of
+from gmijax.sim.warp import kernels
+from gmijax.sim.warp.kernels import Variant, compile_kernels, launched_by
 
-PENDULUM = """<mujoco><option integrator="{}"/><worldbody><body name="arm"><joint name="hinge"/>
-<geom size="0.1"/></body></worldbody><sensor>{}</sensor></mujoco>"""
-SENSOR = '<jointpos joint="hinge"/>'
-ALL = ["constraint", "forward", "passive", "smooth", "solver", "support"]
-
-
-def pendulum(integrator: str = "Euler", sensor: str = "") -> Any:
-    return mujoco.MjModel.from_xml_string(PENDULUM.format(integrator, sensor))
+BROKEN = "broken"
+"""A module that cannot be compiled."""
 
 
-@pytest.mark.parametrize(
-    ("integrator", "sensor", "more"),
-    [
-        ("Euler", "", []),
-        ("implicitfast", "", ["derivative"]),
-        ("implicit", SENSOR, ["sensor", "derivative"]),
-    ],
-)
-def test_a_model_needs_modules_of_its_kind(integrator: str, sensor: str, more: list[str]) -> None:
-    names = list(modules_of(pendulum(integrator, sensor)))
-    assert names == ALL + more
-    folder = Path(mujoco.mjx.__file__).parent / "third_party" / "mujoco_warp" / "_src"
-    assert f"{PACKAGE}.x" == "mujoco.mjx.third_party.mujoco_warp._src.x"
-    for name in names:
-        assert "\n@wp.kernel" in (folder / f"{name}.py").read_text()
+class Warp:
+    """What of Warp is used, with one kernel in each module.
+
+    Attributes:
+      compiled: variants, with how many threads were compiling.
+      launched: names of kernels that ran.
+    """
+
+    def __init__(self) -> None:
+        self.compiled: list[Variant] = []
+        self.launched: list[str] = []
+        self.threads: set[int] = set()
+        fake = self
+
+        class Module:
+            def __init__(self, name: str) -> None:
+                self.name = name
+
+            def load(self, device: Any, block_dim: int | None = None) -> Any:
+                if self.name == BROKEN:
+                    raise RuntimeError("no such instruction")
+                fake.compiled.append(Variant(self.name, block_dim))
+                fake.threads.add(threading.get_ident())
+                return object()
+
+        self.Module = Module
+        self.utils = SimpleNamespace(
+            segmented_sort_pairs=self.sort, radix_sort_pairs=self.sort, array_scan=self.sort
+        )
+        self.modules: dict[str, Any] = {}
+
+    def kernel(self, name: str) -> Any:
+        return SimpleNamespace(module=self.modules.setdefault(name, self.Module(name)))
+
+    def launch(self, name: str, block_dim: int = 256) -> None:
+        if self.kernel(name).module.load("cuda:0", block_dim):
+            self.launched.append(name)
+
+    def sort(self) -> None:
+        self.launched.append("sort")
+
+    def capture_while(self, condition: bool, while_body: Any, stream: Any = None) -> None:
+        while condition:
+            raise AssertionError("nobody has computed the condition")
+
+    def capture_if(self, condition: bool, on_true: Any = None, on_false: Any = None) -> None:
+        (on_true if condition else on_false)()
+
+    def get_suggested_block_size(self, kernel: Any) -> tuple[int, int]:
+        return (128, 1) if kernel.module.load("cuda:0") else (0, 0)
+
+    def get_cuda_device(self) -> str:
+        return "cuda:0"
+
+    def ScopedDevice(self, device: str) -> Any:  # noqa: N802
+        return nullcontext(device)
+
+    def force_load(
+        self, device: str, modules: list[Any], *, block_dim: int | None, max_workers: int
+    ) -> None:
+        assert (device, max_workers) == ("cuda:0", 0)
+        for module in modules:
+            module.load(device, block_dim)
 
 
-@pytest.mark.parametrize(("backend", "cores"), [("gpu", 2), ("gpu", 64), ("cpu", 2)])
-def test_modules_are_compiled_on_all_cores_where_jax_has_a_gpu(
-    backend: str, cores: int, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def warp(monkeypatch: pytest.MonkeyPatch) -> Warp:
+    fake = Warp()
+
+    def step(*_: Any) -> None:
+        fake.launch("smooth")
+        fake.launch("smooth", 32)
+        fake.capture_if(False, on_true=lambda: fake.launch("contacts"), on_false=None)
+        size, count = fake.get_suggested_block_size(fake.kernel("rows"))
+        fake.launch("rows", size // count)
+        fake.utils.array_scan()
+        fake.capture_while(True, while_body=lambda: fake.launch("solver"))
+        fake.launch("smooth")
+
+    package = SimpleNamespace(put_model=lambda model: model, make_data=lambda _: None, step=step)
+    loaded = SimpleNamespace(warp=fake, mujoco_warp=package)
+    monkeypatch.setattr(kernels, "mjx_warp", loaded)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    return fake
+
+
+STEP = [
+    *(Variant("smooth", 256), Variant("smooth", 32), Variant("contacts", 256)),
+    *(Variant("rows", None), Variant("rows", 1), Variant("solver", 256)),
+]
+
+
+def test_a_step_is_noted_and_nothing_of_it_is_done(warp: Warp) -> None:
+    found = launched_by(lambda: kernels.mjx_warp.mujoco_warp.step())
+    assert [(module.name, block_dim) for module, block_dim in found] == STEP
+    assert (warp.compiled, warp.launched) == ([], [])
+    # Afterwards Warp does what it did before.
+    warp.launch("smooth")
+    warp.utils.array_scan()
+    assert (warp.compiled, warp.launched) == ([Variant("smooth", 256)], ["smooth", "sort"])
+    with pytest.raises(AssertionError, match="nobody has computed"):
+        warp.capture_while(True, while_body=None)
+
+
+def test_what_a_step_launches_before_it_fails_counts(warp: Warp) -> None:
+    def step() -> None:
+        warp.launch("smooth")
+        raise ValueError("wants what a kernel has computed")
+
+    assert [variant.module.name for variant in launched_by(step)] == ["smooth"]
+    warp.launch("smooth")
+    assert warp.launched == ["smooth"]
+
+
+def test_other_threads_launch_as_ever(warp: Warp) -> None:
+    def step() -> None:
+        other = threading.Thread(target=warp.launch, args=("theirs",))
+        other.start()
+        other.join()
+
+    assert launched_by(step) == []
+    assert warp.launched == ["theirs"]
+
+
+@pytest.mark.parametrize(("cores", "most"), [(1, 1), (64, len(STEP))])
+def test_all_are_compiled_before_the_first_is_launched(
+    warp: Warp, cores: int, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    loaded: list[Any] = []
-    warp: Any = ModuleType("warp")
-    warp.get_cuda_device = lambda: "cuda:0"
-    warp.get_module = lambda name: name.removeprefix(f"{PACKAGE}.")
-    warp.force_load = lambda device, modules, max_workers: loaded.append(
-        (device, modules, max_workers)
-    )
-    monkeypatch.setitem(sys.modules, "warp", warp)
-    kernels = PACKAGE.removesuffix("._src")
-    monkeypatch.setitem(sys.modules, kernels, ModuleType(kernels))
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)))
-    monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    compile_kernels(pendulum())
-    assert loaded == ([("cuda:0", ALL, min(cores, 6))] if backend == "gpu" else [])
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    compile_kernels(object())
+    assert sorted(map(str, warp.compiled)) == sorted(map(str, STEP))
+    assert 1 <= len(warp.threads) <= most
+    assert threading.get_ident() not in warp.threads
+    assert warp.launched == []
+
+
+def test_a_kernel_that_cannot_be_compiled_says_so_when_it_is_launched(
+    warp: Warp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = kernels.mjx_warp.mujoco_warp
+    monkeypatch.setattr(package, "step", lambda *_: [warp.launch(BROKEN), warp.launch("smooth")])
+    compile_kernels(object())
+    assert warp.compiled == [Variant("smooth", 256)]
+    with pytest.raises(RuntimeError, match="no such instruction"):
+        warp.launch(BROKEN)
+
+
+def test_a_model_that_launches_nothing(warp: Warp, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels.mjx_warp.mujoco_warp, "step", lambda *_: None)
+    compile_kernels(object())
+    assert warp.compiled == []
+
+
+BALL = """<mujoco><option integrator="implicitfast"/><worldbody>
+<geom type="plane" size="1 1 1"/><body pos="0 0 0.1"><freejoint/><geom size="0.1"/></body>
+</worldbody></mujoco>"""
+
+
+def test_a_step_of_mujoco_warp_loads_what_was_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = pytest.importorskip("warp")
+    package = kernels.mjx_warp.mujoco_warp
+    mj_model, loaded = mujoco.MjModel.from_xml_string(BALL), dict[Variant, None]()
+    load = real.Module.load
+
+    def noted(module: Any, device: Any, block_dim: int | None = None) -> Any:
+        loaded[Variant(module, block_dim)] = None
+        return load(module, device, block_dim)
+
+    with real.ScopedDevice("cpu"):
+        model, data = package.put_model(mj_model), package.make_data(mj_model)
+        before = data.qvel.numpy().copy()
+        found = launched_by(lambda: package.step(model, data))
+        assert np.array_equal(data.qvel.numpy(), before)
+        monkeypatch.setattr(real.Module, "load", noted)
+        package.step(model, data)
+    assert not np.array_equal(data.qvel.numpy(), before)
+    assert loaded
+    assert set(loaded) <= set(found)
+
+
+def test_without_a_gpu_nothing_is_compiled(warp: Warp, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    compile_kernels(object())
+    assert warp.compiled == []

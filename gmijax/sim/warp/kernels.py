@@ -1,39 +1,120 @@
-"""Kernels of MuJoCo Warp that are the same for all models, compiled at the same time."""
+"""Kernels of MuJoCo Warp, all that a step of a model launches, compiled at the same time."""
 
 from __future__ import annotations
 
-import importlib
 import os
-from collections.abc import Iterator
-from typing import Any
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
+from mujoco.mjx import warp as mjx_warp
 
-PACKAGE = "mujoco.mjx.third_party.mujoco_warp._src"
-_OF_ALL = ("constraint", "forward", "passive", "smooth", "solver", "support")
-_IMPLICIT = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+_ANY_SIZE = (64, 64)
+"""Threads of a block and blocks, where Warp would ask a kernel that is not compiled yet."""
+
+
+class Variant(NamedTuple):
+    """Kernels that Warp compiles together.
+
+    Attributes:
+      module: Warp's; many kernels of a model have one of their own.
+      block_dim: threads of a block, for which they are compiled; None: the module's default.
+    """
+
+    module: Any
+    block_dim: int | None
 
 
 def compile_kernels(mj_model: mujoco.MjModel) -> None:
     """Compiles those that a step of this model launches, or loads them from Warp's cache.
 
-    Warp would compile each module when one of its kernels is launched first, one after the other.
-    So it does with kernels that are generated for a model. Where JAX has no GPU, nothing is done.
+    Warp would compile them when each is launched first, one after the other. Where JAX has no
+    GPU, nothing is done.
     """
     if jax.default_backend() != "gpu":
         return
-    importlib.import_module(PACKAGE.rpartition(".")[0])  # Registers its kernels.
-    warp: Any = importlib.import_module("warp")
-    modules = [warp.get_module(f"{PACKAGE}.{name}") for name in modules_of(mj_model)]
-    num_workers = min(len(modules), len(os.sched_getaffinity(0)))
-    warp.force_load(warp.get_cuda_device(), modules, max_workers=num_workers)
+    warp, mujoco_warp = mjx_warp.warp, mjx_warp.mujoco_warp
+    device = warp.get_cuda_device()
+    with warp.ScopedDevice(device):
+        model, data = mujoco_warp.put_model(mj_model), mujoco_warp.make_data(mj_model)
+        variants = launched_by(lambda: mujoco_warp.step(model, data))
+
+    def load(variant: Variant) -> None:
+        with suppress(Exception):  # A kernel that is launched says so again.
+            warp.force_load(device, [variant.module], block_dim=variant.block_dim, max_workers=0)
+
+    num_threads = max(1, min(len(variants), len(os.sched_getaffinity(0))))
+    with ThreadPoolExecutor(num_threads) as threads:
+        list(threads.map(load, variants))
 
 
-def modules_of(mj_model: mujoco.MjModel) -> Iterator[str]:
-    """Modules of the package with kernels of a step."""
-    yield from _OF_ALL
-    if mj_model.nsensor:
-        yield "sensor"
-    if mj_model.opt.integrator in _IMPLICIT:
-        yield "derivative"
+def launched_by(step: Callable[[], None]) -> list[Variant]:
+    """What a step launches, without launching it: its arrays keep what they have.
+
+    Both sides of a condition count, and a loop whose end is computed is gone through once.
+    """
+    found: dict[Variant, None] = {}
+    with _noting(found), suppress(Exception):  # What is found until then saves time too.
+        step()
+    return list(found)
+
+
+@contextmanager
+def _noting(found: dict[Variant, None]) -> Iterator[None]:
+    """Has Warp note what this thread would load or launch."""
+    warp = mjx_warp.warp
+
+    def load(module: Any, device: Any, block_dim: int | None = None, **_: Any) -> None:
+        found[Variant(module, block_dim)] = None  # Without a module a launch does nothing.
+
+    def capture_while(_: Any, while_body: Any, stream: Any = None, **given: Any) -> None:
+        while_body(**given)
+
+    def capture_if(
+        _: Any, on_true: Any = None, on_false: Any = None, stream: Any = None, **given: Any
+    ) -> None:
+        for side in filter(callable, (on_true, on_false)):
+            side(**given)
+
+    def get_suggested_block_size(kernel: Any, device: Any = None) -> tuple[int, int]:
+        kernel.module.load(device)
+        return _ANY_SIZE
+
+    def nothing(*_: Any, **__: Any) -> None:
+        """Of what sorts by arrays that nobody has computed."""
+
+    with (
+        _replaced(warp.Module, load=load),
+        _replaced(warp, capture_while=capture_while, capture_if=capture_if),
+        _replaced(warp, get_suggested_block_size=get_suggested_block_size),
+        _replaced(
+            warp.utils, segmented_sort_pairs=nothing, radix_sort_pairs=nothing, array_scan=nothing
+        ),
+    ):
+        yield
+
+
+@contextmanager
+def _replaced(owner: Any, **others: Callable[..., Any]) -> Iterator[None]:
+    """Other functions in place of those of `owner`, in this thread."""
+    own = {name: getattr(owner, name) for name in others}
+    thread = threading.get_ident()
+
+    def chosen(name: str) -> Callable[..., Any]:
+        def call(*args: Any, **given: Any) -> Any:
+            is_here = threading.get_ident() == thread
+            return (others if is_here else own)[name](*args, **given)
+
+        return call
+
+    for name in others:
+        setattr(owner, name, chosen(name))
+    try:
+        yield
+    finally:
+        for name, function in own.items():
+            setattr(owner, name, function)
