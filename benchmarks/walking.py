@@ -237,14 +237,17 @@ def _without_folder(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_tested(run: Mapping[str, Any]) -> bool:
-    """Whether it is known of a training if it walks: the deadline may have ended its tests."""
+    """Whether the tests of a training were enough to say if it walks.
+
+    The deadline may have ended them.
+    """
     return bool(run.get("walks_from")) or all("walk" in one for one in run["checkpoints"])
 
 
 def summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Of each trainer: how many trainings walk, and least, median and most of when they do.
 
-    `seeds` are those that are tested.
+    `seeds` are those that are tested, `untested` the others.
     """
     rows: dict[str, Any] = {}
     for trainer in dict.fromkeys(run["trainer"] for run in runs):
@@ -254,7 +257,8 @@ def summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             key: _spread([one[key] for one in walking])
             for key in ("env_steps", "command_s", "training_s")
         }
-        rows[trainer] = {"seeds": len(mine), "walk": len(walking), **spread}
+        left = sum(run["trainer"] == trainer for run in runs) - len(mine)
+        rows[trainer] = {"seeds": len(mine), "walk": len(walking), "untested": left, **spread}
     return rows
 
 

@@ -83,7 +83,10 @@ def main(path: str, *options: str) -> None:
     policy = onnxruntime.InferenceSession(path)
     sizes = policy.get_inputs()[0].shape[1], policy.get_outputs()[0].shape[1]
     if sizes != SIZES:
-        sys.exit(f"{path}: of a task with {sizes} observations and actions, not {SIZES}")
+        sys.exit(
+            f"{path}: the policy of another task: it has {sizes[0]} observations and {sizes[1]} "
+            f"actions, this example {SIZES[0]} and {SIZES[1]}"
+        )
     data = mujoco.MjData(mujoco.MjModel.from_xml_path(str(MODEL)))
     rng = np.random.default_rng(0)
     if "--view" not in options:

@@ -102,7 +102,8 @@ def seconds_until_it_walks(task: str, impl: str) -> tuple[Figure | None, str]:
 
 
 def _walk(row: Mapping[str, Any]) -> str:
-    return f"{row['walk']} of {row['seeds']}"
+    more = f", {row['untested']} not tested" if row["untested"] else ""
+    return f"{row['walk']} of {row['seeds']}{more}"
 
 
 def _last_tests(call: Call, trainer: str) -> Iterator[str]:

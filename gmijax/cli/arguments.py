@@ -121,7 +121,7 @@ def _unreadable(text: str, error: HydraException) -> ConfigError:
     if not value or not re.fullmatch(r"[\w.+~/@:$-]+", key, re.ASCII):
         return ConfigError(f"{text}: expected key=value")
     if not all(key.lstrip("+~").split("@")[0].split(".")):
-        return ConfigError(f"{text}: expected a name before and after every dot of {key}")
+        return ConfigError(f"{text}: a name is missing before or after a dot of the key")
     if function := re.search(r"while evaluating .*", str(error)):
         return ConfigError(f"{text}: {function[0]}")
     text_of_it = f"{key}={quoted(value)}"

@@ -48,7 +48,10 @@ def as_the_run_was(
     """
     if not all(isinstance(data[group], dict) for group in ("run", "env", "algo")):
         return data  # Refused later.
-    folder = given_run(data["run"]["dir"], data["run"]["name"])
+    given = data["run"]["dir"], data["run"]["name"]
+    if not all(isinstance(name, str | int | None) for name in given):
+        return data
+    folder = given_run(*(str(name) if isinstance(name, int) else name for name in given))
     if folder is None or not os.path.isdir(folder):
         return data
     paths = RunPaths(Path(folder))

@@ -177,9 +177,10 @@ def why_not_again(error: GmiFailed, last: GmiFailed | None) -> str | None:
     if error.is_final:
         return "the last attempt left something behind, or nothing can be started"
     if (reported := error.error) is None:
-        # A library has ended the process, e.g. for an unknown flag. Signals may be of outside.
-        ends = [(one.error, one.exit_code, one.iteration) for one in (last, error) if one]
-        if error.exit_code > 0 and ends[1:] and ends[0] == ends[1]:
+        # A library has ended the process, e.g. for an unknown flag. A signal may have come from
+        # outside.
+        before = None if last is None or last.error else (last.exit_code, last.iteration)
+        if error.exit_code > 0 and before == (error.exit_code, error.iteration):
             return f"exit code {error.exit_code} at the same iteration ({error.iteration}) twice"
         return None
     if reported.type in _LASTING:

@@ -16,12 +16,7 @@ from gmijax.control.console import nearby
 from gmijax.control.start_point import StartPoint, has_trained
 from gmijax.control.summary import train_summary
 from gmijax.partition.plan import Plan
-from gmijax.runs.checkpoints import (
-    CheckpointMeta,
-    drop_unfinished,
-    newest_checkpoint,
-    none_is_whole,
-)
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of, drop_unfinished
 from gmijax.runs.folder import (
     RunPaths,
     add_event,
@@ -156,10 +151,7 @@ def what_is_left(config: TrainConfig, run: RunPaths) -> str:
     status = read_json(result)["status"] if result.exists() else None
     if status == "completed":
         return f"training was complete: {folder}"
-    found = newest_checkpoint(run.root)
-    if found.checkpoint is None and found.passed_over:
-        return f"{none_is_whole(found)}; the run folder stays: {folder}"
-    if found.checkpoint is not None:
+    if checkpoints_of(run.root):
         # Task and algorithm are those of the command: without them the defaults are compared.
         job = f"{config.env.words} algo={config.algo.name}"
         command = f"gmijax train {job} run.dir={shlex.quote(folder)} run.resume=auto"

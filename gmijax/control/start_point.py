@@ -113,6 +113,8 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
     run = RunPaths(folder.resolve())
     if holds_something_else(run.root, own=run.config, lock=run.lock):
         raise ConfigError(f"{shown} {NO_RUN_FOLDER}")
+    if os.path.lexists(run.checkpoints) and not run.checkpoints.is_dir():
+        raise ConfigError(f"run.resume=auto: {run.checkpoints} is not a folder")
     if not run.config.exists():
         return StartPoint(run)
     saved = config_of_run(run)
@@ -126,7 +128,7 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
     found = newest_checkpoint(folder)
     if found.checkpoint is None and found.passed_over:
         raise ConfigError(
-            f"{shown}: {none_is_whole(found)}; to train anew, choose another run.dir or remove "
+            f"{shown}: {none_is_whole(found)}; to train anew, choose another folder or remove "
             f"{run.checkpoints}"
         )
     changes = differences(saved, config).values()

@@ -39,7 +39,7 @@ class EpisodeOptions(NamedTuple):
       deterministic: act with the policy's mean instead of sampling.
       max_steps: where episodes are cut off, None for nowhere.
       first_env: number of the first environment, from which its random key comes.
-      key: what sets N.
+      key: the configuration key that sets N, for messages.
     """
 
     num_envs: int

@@ -32,7 +32,7 @@ def keep_last_replays(paths: RunPaths, last: Path) -> None:
             continue
         try:
             meta = CheckpointMeta.read(checkpoint)
-        except ConfigError:  # A damaged one, which whoever wants to continue is told of.
+        except ConfigError:  # A damaged one: a resume names it.
             continue
         # First the list of files, so that it is a whole checkpoint at any time.
         names = {path.name for path in replays}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 
 from gmijax.devices import memory_limit_bytes
@@ -36,6 +38,6 @@ def require_room(key: str, num_envs: int, state: PyTree) -> None:
     if limit is not None and least > limit:
         raise ConfigError(
             f"{key}: {num_envs} environments in one process would need more than "
-            f"{in_gib(least)}, and there is {in_gib(limit)}; at most "
-            f"{int(limit * num_envs / least)} fit"
+            f"{in_gib(least)}, and there is {in_gib(limit)}; fewer than "
+            f"{math.ceil(limit * num_envs / least)} can fit"
         )

@@ -25,6 +25,7 @@ from gmijax.runs.folder import (
 from gmijax.runs.names import by_steps, steps_name, steps_of
 
 _CHUNK_BYTES: Final = 1 << 20
+_PASSED_OVER: Final = "passed over, "
 
 _DIGEST: Final = "sha256"
 """Key of `meta.json`."""
@@ -98,7 +99,8 @@ def checkpoints_of(folder: Path) -> list[Path]:
 
     What has another name than gmijax gives is somebody's copy, and none of them.
     """
-    return by_steps(RunPaths(folder).checkpoints)
+    found = by_steps(RunPaths(folder).checkpoints)
+    return [path for path in found if os.path.lexists(path / META)]
 
 
 def drop_unfinished(run: RunPaths) -> None:
@@ -109,21 +111,25 @@ def drop_unfinished(run: RunPaths) -> None:
 
 
 def newest_checkpoint(folder: Path) -> NewestCheckpoint:
-    """The newest checkpoint of a run folder whose files are as they were written."""
+    """The newest checkpoint of a run folder whose files are as they were written.
+
+    What has lost its meta data is passed over as any other that is damaged.
+    """
     passed_over: list[str] = []
-    for checkpoint in reversed(checkpoints_of(folder)):
+    for checkpoint in reversed(by_steps(RunPaths(folder).checkpoints)):
         wrong = what_is_broken(checkpoint)
         if wrong is None:
             return NewestCheckpoint(checkpoint.resolve(), tuple(passed_over))
-        passed_over.append(f"checkpoint {checkpoint}: passed over, {wrong}")
+        passed_over.append(f"checkpoint {checkpoint}: {_PASSED_OVER}{wrong}")
     return NewestCheckpoint(None, tuple(passed_over))
 
 
 def none_is_whole(found: NewestCheckpoint) -> str:
-    """Says so, with what is wrong with the newest one; there are some."""
+    """Says that no checkpoint is whole, and what is wrong with the newest of those there are."""
     newest, *others = found.passed_over
     more = f" (and {len(others)} more)" if others else ""
-    return f"no checkpoint is whole: {newest.removeprefix('checkpoint ')}{more}"
+    what = newest.removeprefix("checkpoint ").replace(_PASSED_OVER, "")
+    return f"no checkpoint is whole: {what}{more}"
 
 
 def what_is_broken(checkpoint: Path) -> str | None:

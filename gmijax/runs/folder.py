@@ -204,7 +204,7 @@ def given_run(run_dir: str | None, name: str | None) -> Path | None:
     """
     if run_dir:
         return Path(run_dir)
-    if name and (os.path.isabs(name) or ".." in Path(name).parts):
+    if name and (os.path.isabs(name) or ".." in Path(name).parts or not Path(name).parts):
         raise ConfigError(
             f"run.name={name}: expected a name below {RUNS}/; run.dir takes any path"
         )

@@ -57,7 +57,7 @@ def attempt_folders(gmi: Path) -> list[Path]:
 def _named(folder: Path, form: str) -> list[Path]:
     try:
         names = os.listdir(folder)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return []
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be read ({error.strerror})") from None

@@ -130,5 +130,5 @@ def test_the_example_refuses_the_policy_of_another_task(tmp_path: Path):
         text=True,
         check=False,
     )
-    said = "policy.onnx: of a task with (60, 60) observations and actions, not (24, 3)\n"
-    assert (done.returncode, done.stderr) == (1, said)
+    said = "policy.onnx: the policy of another task: it has 60 observations and 60 actions, "
+    assert (done.returncode, done.stderr) == (1, f"{said}this example 24 and 3\n")

@@ -171,7 +171,7 @@ def test_a_training_whose_tests_were_cut_short_counts_neither_way():
     cut = [_run_of("gmijax", checkpoints(*walks)) for walks in ((False, None), (None,))]
     tested = _run_of("gmijax", checkpoints(False, False))
     row = summary([*cut, tested])["gmijax"]
-    assert (row["seeds"], row["walk"]) == (1, 0)
+    assert (row["seeds"], row["walk"], row["untested"]) == (1, 0, 2)
     assert summary(cut)["gmijax"]["seeds"] == 0
 
 
@@ -184,6 +184,7 @@ def test_summary_has_least_median_and_most_of_those_that_walk():
     assert row["gmijax"] == {
         "seeds": 4,
         "walk": 3,
+        "untested": 0,
         "env_steps": [10, 10, 20],
         "command_s": [2.0, 2.0, 4.0],
         "training_s": [1.0, 1.0, 2.0],
@@ -304,8 +305,10 @@ def test_a_policy_of_brax_gets_its_observations_by_name(tmp_path):
     assert np.asarray(acted) == pytest.approx(np.asarray(act(named, key)[0]), abs=1e-6)
 
 
-def _add_call(folder, seconds, given, *, task="go1", is_cold=False, seeds=5, script=False):
-    """A call of a walking benchmark, as if it had been measured."""
+def _add_call(
+    folder, seconds, given, *, task="go1", is_cold=False, seeds=5, script=False, num_cut=0
+):
+    """A call of a walking benchmark, as if it had been measured; with no time for some tests."""
     settings = {"cold": is_cold, "overrides": given}
     file = ResultsFile(folder / "walking-go1-nvidia-h100.json", "walking", settings, device="H100")
     errors = {"linear_m_per_s": seconds / 1000, "yaw_rad_per_s": None}
@@ -320,10 +323,10 @@ def _add_call(folder, seconds, given, *, task="go1", is_cold=False, seeds=5, scr
         }
         for steps, at_s in [(4e7, 50.0), *middle, (6e7, 120.0)]
     ]
-    cut = {"trainer": "gmijax", "checkpoints": tests[1:]}  # No time was left for its tests.
+    cut = [{"trainer": "gmijax", "checkpoints": tests[1:]}] * num_cut
     by_script = [{"trainer": SCRIPT, "checkpoints": tests[:1]}] if script else []
     with file.changing() as results:
-        results.update(task=task, runs=[*runs, cut, *by_script])
+        results.update(task=task, runs=[*runs, *cut, *by_script])
 
 
 def _rows_of_the_table():
@@ -376,6 +379,17 @@ def test_a_call_with_fewer_seeds_does_not_take_the_place_of_one_with_more(tmp_pa
     _add_call(tmp_path, 60.0, by_sac, script=True)
     whole = [line.replace("3 of 3", "5 of 5") for line in beside]
     assert _rows_of_the_table() == whole
+
+
+def test_trainings_without_tests_are_named_and_do_not_count(tmp_path, monkeypatch):
+    monkeypatch.setattr(records, "RESULTS", tmp_path)
+    by_sac = ["env=go1", "algo=sac"]
+    _add_call(tmp_path, 60.0, by_sac, seeds=3, num_cut=2)
+    (row,) = _rows_of_the_table()
+    assert row.split(" | ")[3:5] == ["from the cache", "3 of 3, 2 not tested"]
+    assert seconds_until_it_walks("go1", "warp")[1] == "3 of 3, 2 not tested"
+    _add_call(tmp_path, 70.0, by_sac, seeds=4)
+    assert seconds_until_it_walks("go1", "warp")[1] == "4 of 4"
 
 
 def test_one_program_tests_all_checkpoints_of_a_kind(tmp_path, monkeypatch):

@@ -16,6 +16,8 @@ from toy_env import point_mass_env
 from gmijax.cli.compose import compose
 from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.config import TrainConfig
+from gmijax.errors import ConfigError
+from gmijax.learning import memory
 from gmijax.learning.episodes import CHUNK_STEPS
 from gmijax.learning.evaluator import Evaluation, Evaluator
 from gmijax.learning.learner import init_learner, make_learner
@@ -131,6 +133,17 @@ def test_an_evaluation_is_the_best_if_none_before_was_as_good(config: TrainConfi
     assert evaluator.wall_s == pytest.approx(sum(e.wall_s for e in found))
     evaluator.best = 1e9  # Of a run that goes on.
     assert not evaluator.run(states[0], 64, lambda: None, lambda: False).is_best
+
+
+def test_more_episodes_than_memory_holds_are_refused_before_they_begin(
+    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner = make_learner(ENV.spec, config.algo)
+    evaluator = Evaluator(ENV, learner, config, SingleRankCommunicator(), NOWHERE)
+    state = init_learner(learner, ENV.spec.obs_size, jax.random.key(1))
+    monkeypatch.setattr(memory, "memory_bytes", lambda: 64.0)
+    with pytest.raises(ConfigError, match=r"^eval\.episodes: 5 environments in one process would"):
+        evaluator.trace(state)
 
 
 def test_evaluations_come_whenever_so_many_steps_are_done(config: TrainConfig) -> None:

@@ -72,9 +72,9 @@ def test_more_environments_than_memory_holds_are_refused_before_they_are_made(
     algo: AlgoConfig, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(memory, "memory_bytes", lambda: 64.0)
-    wrong = r"^eval\.episodes: 8 environments in one process .*; at most \d fit"
+    wrong = r"^num_envs: 8 environments in one process .*; fewer than \d can fit"
     with pytest.raises(ConfigError, match=wrong):
-        episodes_of(algo, counting_env(), key="eval.episodes")
+        episodes_of(algo, counting_env())
 
 
 def test_every_environment_plays_one_episode_and_no_more(played: Episodes):

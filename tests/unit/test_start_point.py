@@ -75,6 +75,18 @@ def test_auto_goes_on_from_the_newest_checkpoint_that_is_whole(run: RunPaths):
     assert find_start_point(config_of(run.root, "num_timesteps=100")).is_complete
 
 
+@pytest.mark.parametrize("named", ["run.name=5", "run.dir=runs/5", "run.name='5'"])
+def test_a_run_whose_name_is_a_number_keeps_its_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    line = ("env=ant", named, "run.resume=auto")
+    write_json(RunPaths(Path("runs/5")).config, to_dict(compose(*line, "num_envs=24")))
+    assert compose(*line).num_envs == 24
+    assert compose(*line, "num_envs=8").num_envs == 8
+
+
 @pytest.mark.parametrize("damage", ["cut", "missing"])
 def test_auto_refuses_a_run_of_which_no_checkpoint_is_whole(run: RunPaths, damage: str):
     for steps in (100, 200):
@@ -83,8 +95,8 @@ def test_auto_refuses_a_run_of_which_no_checkpoint_is_whole(run: RunPaths, damag
             meta.unlink()
         else:
             meta.write_text("{")
-    wrong = r"no checkpoint is whole: .*/000000000200: passed over, .*meta.json.* \(and 1 more\)"
-    advice = f"; to train anew, choose another run.dir or remove {run.checkpoints}"
+    wrong = r"no checkpoint is whole: .*/000000000200: broken meta.json .* \(and 1 more\)"
+    advice = f"; to train anew, choose another folder or remove {run.checkpoints}"
     with pytest.raises(ConfigError, match=f"^run.resume=auto: {run.root}: {wrong}{advice}$"):
         find_start_point(config_of(run.root))
     shutil.rmtree(run.checkpoints)
@@ -94,7 +106,7 @@ def test_auto_refuses_a_run_of_which_no_checkpoint_is_whole(run: RunPaths, damag
 def test_a_file_in_place_of_the_checkpoints_is_found_before_anything_is_trained(run: RunPaths):
     run.checkpoints.parent.mkdir(exist_ok=True)
     run.checkpoints.write_text("")
-    with pytest.raises(ConfigError, match=r"/checkpoints: cannot be read \(Not a directory\)$"):
+    with pytest.raises(ConfigError, match=r"^run.resume=auto: .*/checkpoints is not a folder$"):
         find_start_point(config_of(run.root))
 
 

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 import gmijax
+from gmijax.errors import ConfigError
+from gmijax.learning import memory
 from gmijax.learning.learner import init_learner, make_learner
 from gmijax.learning.walking import WalkingTest, act_of
 from gmijax.player import walking
@@ -121,6 +123,10 @@ def recorded(monkeypatch):
 
     test = WalkingTest(env, ROBOTS["go1"], act, num_envs=3, seed=0, length_s=1.3)
     weights = jnp.array([2.0, -1.0])
+    with pytest.MonkeyPatch.context() as little:
+        little.setattr(memory, "memory_bytes", lambda: 64.0)
+        with pytest.raises(ConfigError, match=r"^walking_envs: 3 environments in one process"):
+            test.compile(weights)
     test.compile(weights)
     chunks = []
     test.run(weights, chunks.append)

@@ -16,6 +16,7 @@ import pytest
 from gmijax.sim.warp import kernels
 from gmijax.sim.warp.kernels import Variant, compile_kernels, launched_by
 
+ANY_MODEL: Any = None
 BROKEN = "broken"
 """A module that cannot be compiled."""
 
@@ -24,24 +25,28 @@ class Warp:
     """What of Warp is used, with one kernel in each module.
 
     Attributes:
-      compiled: variants, with how many threads were compiling.
+      compiled: variants.
       launched: names of kernels that ran.
+      threads: those that have compiled.
+      at_once: has so many compile at the same time.
     """
 
     def __init__(self) -> None:
         self.compiled: list[Variant] = []
         self.launched: list[str] = []
         self.threads: set[int] = set()
+        self.at_once = threading.Barrier(1)
         fake = self
 
         class Module:
             def __init__(self, name: str) -> None:
-                self.name = name
+                self.name, self.options = name, {"block_dim": 32}
 
             def load(self, device: Any, block_dim: int | None = None) -> Any:
                 if self.name == BROKEN:
                     raise RuntimeError("no such instruction")
-                fake.compiled.append(Variant(self.name, block_dim))
+                fake.at_once.wait(30.0)
+                fake.compiled.append(Variant(self.name, block_dim or self.options["block_dim"]))
                 fake.threads.add(threading.get_ident())
                 return object()
 
@@ -108,7 +113,7 @@ def warp(monkeypatch: pytest.MonkeyPatch) -> Warp:
 
 STEP = [
     *(Variant("smooth", 256), Variant("smooth", 32), Variant("contacts", 256)),
-    *(Variant("rows", None), Variant("rows", 1), Variant("solver", 256)),
+    *(Variant("rows", 32), Variant("rows", 1), Variant("solver", 256)),
 ]
 
 
@@ -144,14 +149,15 @@ def test_other_threads_launch_as_ever(warp: Warp) -> None:
     assert warp.launched == ["theirs"]
 
 
-@pytest.mark.parametrize(("cores", "most"), [(1, 1), (64, len(STEP))])
+@pytest.mark.parametrize(("cores", "at_once"), [(1, 1), (3, 3), (64, len(STEP))])
 def test_all_are_compiled_before_the_first_is_launched(
-    warp: Warp, cores: int, most: int, monkeypatch: pytest.MonkeyPatch
+    warp: Warp, cores: int, at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
-    compile_kernels(object())
+    warp.at_once = threading.Barrier(at_once)
+    compile_kernels(ANY_MODEL)
     assert sorted(map(str, warp.compiled)) == sorted(map(str, STEP))
-    assert 1 <= len(warp.threads) <= most
+    assert len(warp.threads) == at_once
     assert threading.get_ident() not in warp.threads
     assert warp.launched == []
 
@@ -161,15 +167,26 @@ def test_a_kernel_that_cannot_be_compiled_says_so_when_it_is_launched(
 ) -> None:
     package = kernels.mjx_warp.mujoco_warp
     monkeypatch.setattr(package, "step", lambda *_: [warp.launch(BROKEN), warp.launch("smooth")])
-    compile_kernels(object())
+    compile_kernels(ANY_MODEL)
     assert warp.compiled == [Variant("smooth", 256)]
     with pytest.raises(RuntimeError, match="no such instruction"):
         warp.launch(BROKEN)
 
 
+def test_a_model_that_warp_cannot_take_here_is_compiled_as_it_runs(
+    warp: Warp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_memory(_: Any) -> None:
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(kernels.mjx_warp.mujoco_warp, "make_data", no_memory)
+    compile_kernels(ANY_MODEL)
+    assert warp.compiled == []
+
+
 def test_a_model_that_launches_nothing(warp: Warp, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernels.mjx_warp.mujoco_warp, "step", lambda *_: None)
-    compile_kernels(object())
+    compile_kernels(ANY_MODEL)
     assert warp.compiled == []
 
 
@@ -185,7 +202,7 @@ def test_a_step_of_mujoco_warp_loads_what_was_noted(monkeypatch: pytest.MonkeyPa
     load = real.Module.load
 
     def noted(module: Any, device: Any, block_dim: int | None = None) -> Any:
-        loaded[Variant(module, block_dim)] = None
+        loaded[Variant(module, block_dim or module.options["block_dim"])] = None
         return load(module, device, block_dim)
 
     with real.ScopedDevice("cpu"):
@@ -202,5 +219,5 @@ def test_a_step_of_mujoco_warp_loads_what_was_noted(monkeypatch: pytest.MonkeyPa
 
 def test_without_a_gpu_nothing_is_compiled(warp: Warp, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    compile_kernels(object())
+    compile_kernels(ANY_MODEL)
     assert warp.compiled == []

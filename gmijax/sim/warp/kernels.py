@@ -1,4 +1,4 @@
-"""Kernels of MuJoCo Warp, all that a step of a model launches, compiled at the same time."""
+"""Kernels of MuJoCo Warp, nearly all that a step of a model launches, compiled at once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ import mujoco
 from mujoco.mjx import warp as mjx_warp
 
 _ANY_SIZE = (64, 64)
-"""Threads of a block and blocks, where Warp would ask a kernel that is not compiled yet."""
+"""Threads of a block and number of blocks, in place of Warp's answer, which needs a compiled
+kernel."""
+
+_ONE_AT_A_TIME = threading.Lock()
+"""Held while functions of Warp are replaced."""
 
 
 class Variant(NamedTuple):
@@ -22,24 +26,24 @@ class Variant(NamedTuple):
 
     Attributes:
       module: Warp's; many kernels of a model have one of their own.
-      block_dim: threads of a block, for which they are compiled; None: the module's default.
+      block_dim: threads of a block, for which they are compiled.
     """
 
     module: Any
-    block_dim: int | None
+    block_dim: int
 
 
 def compile_kernels(mj_model: mujoco.MjModel) -> None:
     """Compiles those that a step of this model launches, or loads them from Warp's cache.
 
-    Warp would compile them when each is launched first, one after the other. Where JAX has no
-    GPU, nothing is done.
+    Warp would compile them when each is launched first, one after the other, and still does so
+    with what is missed here. Where JAX has no GPU, nothing is done.
     """
     if jax.default_backend() != "gpu":
         return
     warp, mujoco_warp = mjx_warp.warp, mjx_warp.mujoco_warp
-    device = warp.get_cuda_device()
-    with warp.ScopedDevice(device):
+    device, variants = warp.get_cuda_device(), list[Variant]()
+    with suppress(Exception), warp.ScopedDevice(device):
         model, data = mujoco_warp.put_model(mj_model), mujoco_warp.make_data(mj_model)
         variants = launched_by(lambda: mujoco_warp.step(model, data))
 
@@ -53,12 +57,12 @@ def compile_kernels(mj_model: mujoco.MjModel) -> None:
 
 
 def launched_by(step: Callable[[], None]) -> list[Variant]:
-    """What a step launches, without launching it: its arrays keep what they have.
+    """What a step would launch. No kernel runs; what its arrays hold afterwards means nothing.
 
     Both sides of a condition count, and a loop whose end is computed is gone through once.
     """
     found: dict[Variant, None] = {}
-    with _noting(found), suppress(Exception):  # What is found until then saves time too.
+    with _ONE_AT_A_TIME, _noting(found), suppress(Exception):  # Some are better than none.
         step()
     return list(found)
 
@@ -69,7 +73,9 @@ def _noting(found: dict[Variant, None]) -> Iterator[None]:
     warp = mjx_warp.warp
 
     def load(module: Any, device: Any, block_dim: int | None = None, **_: Any) -> None:
-        found[Variant(module, block_dim)] = None  # Without a module a launch does nothing.
+        own = module.options["block_dim"]
+        found[Variant(module, own if block_dim is None else block_dim)] = None
+        # A launch does nothing where this returns None.
 
     def capture_while(_: Any, while_body: Any, stream: Any = None, **given: Any) -> None:
         while_body(**given)
@@ -85,7 +91,7 @@ def _noting(found: dict[Variant, None]) -> Iterator[None]:
         return _ANY_SIZE
 
     def nothing(*_: Any, **__: Any) -> None:
-        """Of what sorts by arrays that nobody has computed."""
+        """Sorts and scans would read arrays that nobody has computed."""
 
     with (
         _replaced(warp.Module, load=load),
