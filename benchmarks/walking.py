@@ -1,11 +1,11 @@
 r"""Seconds until a robot walks: `python -m benchmarks.walking env=go1 --seeds 5`.
 
 Trains with checkpoints on the way, then puts them through the walking test, so that no test costs
-training time. A training walks from the first checkpoint on of which two in a row walk; one whose
-tests were cut short by `--deadline-s` counts neither as walking nor as not. Its
+training time. A training walks from the first checkpoint on of which two in a row walk. Its
 seconds run from the start of the command until the checkpoint is written, and apart from that from
-the first step until the policy is there. Programs, and kernels of MJX-Warp, are compiled before,
-in a short training; with `--cold` every training, and the tests, compile all of them.
+the first step until the policy is there. One whose tests were cut short by `--deadline-s` counts
+neither as walking nor as not. Programs, and kernels of MJX-Warp, are compiled before, in a short
+training; with `--cold` every training, and the tests, compile all of them.
 
     python -m benchmarks.walking env=go1 num_timesteps=60e6 --seeds 5
     python -m benchmarks.walking env=g1 --script='--impl=warp --num_timesteps=200000000'
@@ -251,14 +251,15 @@ def summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """
     rows: dict[str, Any] = {}
     for trainer in dict.fromkeys(run["trainer"] for run in runs):
-        mine = [run for run in runs if run["trainer"] == trainer and is_tested(run)]
+        trained = [run for run in runs if run["trainer"] == trainer]
+        mine = [run for run in trained if is_tested(run)]
         walking = [run["walks_from"] for run in mine if run.get("walks_from")]
         spread = {
             key: _spread([one[key] for one in walking])
             for key in ("env_steps", "command_s", "training_s")
         }
-        left = sum(run["trainer"] == trainer for run in runs) - len(mine)
-        rows[trainer] = {"seeds": len(mine), "walk": len(walking), "untested": left, **spread}
+        counts = {"seeds": len(mine), "walk": len(walking), "untested": len(trained) - len(mine)}
+        rows[trainer] = counts | spread
     return rows
 
 

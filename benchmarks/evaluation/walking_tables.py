@@ -74,15 +74,17 @@ def walking(calls: Calls) -> Rows:
 
 def _physics(call: Call, trainer: str) -> str:
     """The MJX implementation that this trainer's policies were trained and tested with."""
-    runs = [run for run in call.results["runs"] if run["trainer"] == trainer]
-    tests = (one["walk"] for run in runs for one in run["checkpoints"] if "walk" in one)
-    return next((test["impl"] for test in tests), "")
+    tests = (test for run in _runs_of(call, trainer) for test in _tests_of(run))
+    return next((test["walk"]["impl"] for test in tests), "")
 
 
-def _tests_of(call: Call, trainer: str) -> list[list[Mapping[str, Any]]]:
-    """The tested checkpoints of every training whose tests came to their end."""
-    runs = [run for run in call.results["runs"] if run["trainer"] == trainer and is_tested(run)]
-    return [[one for one in run["checkpoints"] if "walk" in one] for run in runs]
+def _runs_of(call: Call, trainer: str) -> list[Mapping[str, Any]]:
+    return [run for run in call.results["runs"] if run["trainer"] == trainer]
+
+
+def _tests_of(run: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The tested checkpoints of a training."""
+    return [one for one in run["checkpoints"] if "walk" in one]
 
 
 def seconds_until_it_walks(task: str, impl: str) -> tuple[Figure | None, str]:
@@ -107,8 +109,9 @@ def _walk(row: Mapping[str, Any]) -> str:
 
 
 def _last_tests(call: Call, trainer: str) -> Iterator[str]:
-    """The last test of every training: medians over seeds."""
-    last = [tests[-1] for tests in _tests_of(call, trainer) if tests]
+    """The last test of every training whose tests came to their end: medians over seeds."""
+    tested = map(_tests_of, filter(is_tested, _runs_of(call, trainer)))
+    last = [tests[-1] for tests in tested if tests]
     settled = [one["walk"]["settled"] for one in last]
     for form, values in (
         (".0f", [one["env_steps"] / 1e6 for one in last]),

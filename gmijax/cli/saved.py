@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from hydra.core.override_parser.types import Override
 
-from gmijax.config.schema import flatten
+from gmijax.config.schema import convert, flatten
 from gmijax.runs.folder import RunPaths, given_run
 from gmijax.runs.saved_config import config_of_run, require_known_keys
 
@@ -44,14 +44,12 @@ def as_the_run_was(
       `data` if there is no run yet, or one of another task or algorithm, which is refused later.
 
     Raises:
-      ConfigError: the run's configuration is broken, or has keys that this version does not know.
+      ConfigError: the run's configuration is broken, or has keys that this version does not know;
+        or the command does not name a folder.
     """
     if not all(isinstance(data[group], dict) for group in ("run", "env", "algo")):
         return data  # Refused later.
-    given = data["run"]["dir"], data["run"]["name"]
-    if not all(isinstance(name, str | int | None) for name in given):
-        return data
-    folder = given_run(*(str(name) if isinstance(name, int) else name for name in given))
+    folder = given_run(*(convert(str | None, data["run"][k], f"run.{k}") for k in ("dir", "name")))
     if folder is None or not os.path.isdir(folder):
         return data
     paths = RunPaths(Path(folder))

@@ -111,7 +111,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
     if missing := [key for key in hints if key not in data and not _has_default(cls, key)]:
         raise ConfigError(f"missing key {path}{missing[0]}")
     given = {key: kind for key, kind in hints.items() if key in data}
-    return cls(**{key: _convert(kind, data[key], path + key) for key, kind in given.items()})
+    return cls(**{key: convert(kind, data[key], path + key) for key, kind in given.items()})
 
 
 def from_named(classes: Sequence[type[T]], data: Mapping[str, Any], path: str = "") -> T:
@@ -191,7 +191,8 @@ def _has_default(cls: Any, key: str) -> bool:
     return (field.default, field.default_factory) != (dataclasses.MISSING, dataclasses.MISSING)
 
 
-def _convert(kind: Any, value: Any, key: str) -> Any:
+def convert(kind: Any, value: Any, key: str) -> Any:
+    """Plain data as a value of the type `kind`; raises ConfigError if it is none."""
     trees: list[Any] = [x for x in _options(kind) if dataclasses.is_dataclass(x)]
     if trees:
         if not isinstance(value, Mapping):
@@ -268,10 +269,10 @@ def _accept_generic(kind: Any, value: Any, key: str) -> Any:
         return value if value in inner else _REJECTED
     if typing.get_origin(kind) is Mapping and isinstance(value, Mapping):
         return {
-            str(name): _convert(inner[1], item, f"{key}.{name}") for name, item in value.items()
+            str(name): convert(inner[1], item, f"{key}.{name}") for name, item in value.items()
         }
     if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
-        return tuple(_convert(inner[0], item, key) for item in value)
+        return tuple(convert(inner[0], item, key) for item in value)
     return _REJECTED
 
 

@@ -126,7 +126,7 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
         )
     require_known_keys(saved, shown)
     found = newest_checkpoint(folder)
-    if found.checkpoint is None and found.passed_over:
+    if found.checkpoint is None and found.broken:
         raise ConfigError(
             f"{shown}: {none_is_whole(found)}; to train anew, choose another folder or remove "
             f"{run.checkpoints}"

@@ -97,7 +97,7 @@ def checkpoint_of(config: PlayConfig | ExportConfig | ViewConfig) -> Path:
 
 def _at_step(run: Path, env_steps: int) -> Path:
     checkpoint = RunPaths(run).checkpoint(env_steps)
-    if not os.path.lexists(checkpoint):
+    if not (checkpoint / META).is_file():
         steps = ", ".join(str(int(path.name)) for path in checkpoints_of(run))
         raise ConfigError(
             f"checkpoint={env_steps}: no such checkpoint in {run}; there are {steps}"

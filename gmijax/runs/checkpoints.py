@@ -25,7 +25,6 @@ from gmijax.runs.folder import (
 from gmijax.runs.names import by_steps, steps_name, steps_of
 
 _CHUNK_BYTES: Final = 1 << 20
-_PASSED_OVER: Final = "passed over, "
 
 _DIGEST: Final = "sha256"
 """Key of `meta.json`."""
@@ -91,7 +90,12 @@ class NewestCheckpoint(NamedTuple):
     """Checkpoints of a run folder."""
 
     checkpoint: Path | None  # The newest one that is whole, None if there is none.
-    passed_over: tuple[str, ...]  # Newer ones, each with what is wrong with it.
+    broken: tuple[tuple[Path, str], ...]  # Newer ones, each with what is wrong with it.
+
+    @property
+    def passed_over(self) -> tuple[str, ...]:
+        """The broken ones, each in a sentence for the user."""
+        return tuple(f"checkpoint {path}: passed over, {wrong}" for path, wrong in self.broken)
 
 
 def checkpoints_of(folder: Path) -> list[Path]:
@@ -115,21 +119,20 @@ def newest_checkpoint(folder: Path) -> NewestCheckpoint:
 
     What has lost its meta data is passed over as any other that is damaged.
     """
-    passed_over: list[str] = []
+    broken: list[tuple[Path, str]] = []
     for checkpoint in reversed(by_steps(RunPaths(folder).checkpoints)):
         wrong = what_is_broken(checkpoint)
         if wrong is None:
-            return NewestCheckpoint(checkpoint.resolve(), tuple(passed_over))
-        passed_over.append(f"checkpoint {checkpoint}: {_PASSED_OVER}{wrong}")
-    return NewestCheckpoint(None, tuple(passed_over))
+            return NewestCheckpoint(checkpoint.resolve(), tuple(broken))
+        broken.append((checkpoint, wrong))
+    return NewestCheckpoint(None, tuple(broken))
 
 
 def none_is_whole(found: NewestCheckpoint) -> str:
     """Says that no checkpoint is whole, and what is wrong with the newest of those there are."""
-    newest, *others = found.passed_over
+    (newest, wrong), *others = found.broken
     more = f" (and {len(others)} more)" if others else ""
-    what = newest.removeprefix("checkpoint ").replace(_PASSED_OVER, "")
-    return f"no checkpoint is whole: {what}{more}"
+    return f"no checkpoint is whole: {newest}: {wrong}{more}"
 
 
 def what_is_broken(checkpoint: Path) -> str | None:

@@ -173,11 +173,9 @@ def first_checkpoint_of(folder: Path) -> str:
 def _written_s(checkpoint: Path) -> tuple[float, float]:
     """When a checkpoint was written; of a run and its copy, which have one time, the run is older.
 
-    Not the time of a folder: that changes with whatever is put into it later, e.g. films. One
-    that has lost its meta data has no other.
+    Not the time of a folder: that changes with whatever is put into it later, e.g. films.
     """
-    meta = checkpoint / META
-    file_s = os.lstat(meta if os.path.lexists(meta) else checkpoint).st_mtime
+    file_s = os.lstat(checkpoint / META).st_mtime
     try:
         noted_s = CheckpointMeta.read(checkpoint).time_s
     except ConfigError:

@@ -95,8 +95,12 @@ def _noting(found: dict[Variant, None]) -> Iterator[None]:
 
     with (
         _replaced(warp.Module, load=load),
-        _replaced(warp, capture_while=capture_while, capture_if=capture_if),
-        _replaced(warp, get_suggested_block_size=get_suggested_block_size),
+        _replaced(
+            warp,
+            capture_while=capture_while,
+            capture_if=capture_if,
+            get_suggested_block_size=get_suggested_block_size,
+        ),
         _replaced(
             warp.utils, segmented_sort_pairs=nothing, radix_sort_pairs=nothing, array_scan=nothing
         ),
