@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmijax.config import TrainConfig
+from gmijax.config.typed import typed
 from gmijax.control.console import nearby
 from gmijax.control.start_point import StartPoint, has_trained
 from gmijax.control.summary import train_summary
@@ -152,8 +153,10 @@ def what_is_left(config: TrainConfig, run: RunPaths) -> str:
     if status == "completed":
         return f"training was complete: {folder}"
     if checkpoints_of(run.root):
-        # Task and algorithm are those of the command: without them the defaults are compared.
-        job = f"{config.env.words} algo={config.algo.name}"
+        # These are of the command, and all other keys of the run (`gmijax.cli.saved`).
+        words = [config.env.words, f"algo={config.algo.name}"]
+        words += [*typed(config.plan), *typed(config.cluster)]
+        job = " ".join(words)
         command = f"gmijax train {job} run.dir={shlex.quote(folder)} run.resume=auto"
         if status is None:
             return f"to continue from the last checkpoint: {command}"

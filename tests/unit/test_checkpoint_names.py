@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 from pathlib import Path
 
@@ -107,6 +108,15 @@ def test_a_restart_leaves_alone_what_is_not_its_own(run: RunPaths):
         (("env=ant",), "env=ant algo=ppo"),
         (("env=brax", "env.name=ant"), "env=brax env.name=ant algo=ppo"),
         (("env=my tasks/cart.py:make", "algo=sac"), "env='my tasks/cart.py:make' algo=sac"),
+        (("env=ant", "plan.gmis_per_gpu=2"), "env=ant algo=ppo plan.gmis_per_gpu=2"),
+        (
+            ("env=ant", "plan.layout=[[0,1],[2]]", "plan.sm_percent=[30,30.5,40]"),
+            "env=ant algo=ppo 'plan.layout=[[0,1],[2]]' 'plan.sm_percent=[30.0,30.5,40.0]'",
+        ),
+        (
+            ("env=ant", "cluster.engine=ray", "cluster.address='[::1]:6379'"),
+            "env=ant algo=ppo cluster.engine=ray 'cluster.address=\"[::1]:6379\"'",
+        ),
     ],
 )
 def test_a_job_that_was_stopped_says_how_to_continue_if_it_can(
@@ -123,6 +133,8 @@ def test_a_job_that_was_stopped_says_how_to_continue_if_it_can(
     assert what_is_left(config, run) == f"to continue from the last checkpoint: {command}"
     write_json(run.gmi(0).result, {"status": "stopped"})
     assert what_is_left(config, run) == f"the run is saved. To continue: {command}"
+    again = build("train", TrainConfig, shlex.split(command)[2:])
+    assert (again.plan, again.cluster) == (config.plan, config.cluster)
 
 
 @pytest.mark.parametrize(
