@@ -6,7 +6,6 @@ enters the backend, runs the GMIs, and writes the summary however the job ends.
 
 from __future__ import annotations
 
-import os
 import time
 from contextlib import ExitStack
 from dataclasses import replace
@@ -27,7 +26,7 @@ from gmijax.control.progress import ConsoleProgress
 from gmijax.control.reduced_plan import with_gpus_left, with_nodes_left
 from gmijax.control.restarts import Attempts
 from gmijax.control.run_folder import (
-    clear_unfinished,
+    begin_again,
     drop_half_written,
     opened,
     record_end,
@@ -51,6 +50,7 @@ from gmijax.runs.compile_times import CompileTime
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
 from gmijax.runs.held import OpenFolder, is_locked
 from gmijax.runs.history import MetricsReader, copy_history
+from gmijax.runs.result import summary_of
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import training_kind
 from gmijax.supervise.run_gmis import Launch, recorded
@@ -195,7 +195,7 @@ class _TrainingJob:
     def _prepare(self, start_point: StartPoint) -> None:
         checkpoint = start_point.checkpoint
         if start_point.folder is not None:
-            clear_unfinished(self._run, checkpoint)
+            begin_again(self._run, checkpoint)
         elif checkpoint is not None:
             steps = CheckpointMeta.read(checkpoint).env_steps
             copy_history(RunPaths(checkpoint.parents[1]).metrics, self._run.metrics, steps)
@@ -259,12 +259,13 @@ def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
     """Result of a run that is complete; writes the summary if it is missing."""
     if not is_locked(run.lock):
         drop_half_written(run)  # The controller may have been killed at the very end.
-    summary = read_json(run.summary) if os.path.lexists(run.summary) else {}
+    summary = summary_of(run)
     if summary.get("status") != "completed":
         try:
             plan = Plan.from_dict(read_json(run.plan))
         except ConfigError as error:
-            raise ConfigError(f"{run.plan}: {error}") from None
+            why = str(error).removeprefix(f"{run.plan}: ")
+            raise ConfigError(f"{nearby(run.plan)}: {why}") from None
         summary = train_summary(config, plan, run, "completed", 0.0, [])
         write_json(run.summary, summary)
     console.print(f"this run is complete already: {nearby(run.root)}")

@@ -22,7 +22,7 @@ from gmijax.control.console import announce, open_console
 from gmijax.control.decide import decide
 from gmijax.control.progress import ConsoleProgress
 from gmijax.control.run_folder import (
-    clear_unfinished,
+    begin_again,
     keep_logs,
     opened,
     record_end,
@@ -117,7 +117,7 @@ def _open(
     """One of the runs with its folder, which is held, and what the user should know of it."""
     run, about, folder = held.enter_context(opened(config, start_point))
     if start_point.folder is not None:
-        clear_unfinished(run, start_point.checkpoint)
+        begin_again(run, start_point.checkpoint)
     notes = list(about)
     config = dataclasses.replace(config, physics=physics)
     config = started_from(config, start_point.checkpoint, notes.append)

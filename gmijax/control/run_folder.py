@@ -28,7 +28,7 @@ from gmijax.runs.folder import (
 )
 from gmijax.runs.git import record_git
 from gmijax.runs.held import OpenFolder, gone_if_unused, locked
-from gmijax.runs.history import copy_history, draw_returns
+from gmijax.runs.history import copy_history, draw_returns, read_metrics
 from gmijax.runs.names import attempt_folders, gmi_folders
 from gmijax.runs.resume import choose_checkpoint
 from gmijax.runs.saved_config import saved_config
@@ -91,6 +91,16 @@ def drop_half_written(run: RunPaths) -> None:
     for folder in (run.root, *gmis, *attempts):
         remove_temporary(folder)
     drop_unfinished(run)
+
+
+def begin_again(run: RunPaths, checkpoint: Path | None) -> None:
+    """Prepares a run folder that exists for a job that goes on from a checkpoint, or begins.
+
+    What was trained there without a checkpoint is lost, but not its metrics.
+    """
+    if checkpoint is None and (lines := read_metrics(run.metrics)):
+        run.metrics.rename(run.earlier_metrics(lines[-1]["env_steps"]))
+    clear_unfinished(run, checkpoint)
 
 
 def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:

@@ -23,12 +23,12 @@ from gmijax.runs.folder import (
     create_run,
     given_run,
     holds_something_else,
-    read_json,
     replays_of,
     require_new_run,
 )
 from gmijax.runs.history import read_metrics
 from gmijax.runs.names import nearby
+from gmijax.runs.result import summary_of
 from gmijax.runs.resume import choose_checkpoint
 from gmijax.runs.saved_config import (
     config_of_run,
@@ -91,7 +91,7 @@ def _untrained(config: TrainConfig) -> RunPaths | None:
     if folder is None or not os.path.isfile(RunPaths(folder).summary):
         return None
     run = RunPaths(folder.resolve())
-    summary = read_json(run.summary)
+    summary = summary_of(run)
     has_ended = "algo" in summary and summary.get("status") in ("failed", "interrupted")
     return run if has_ended and not has_trained(run) else None
 
@@ -114,7 +114,7 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
     if holds_something_else(run.root, own=run.config, lock=run.lock):
         raise ConfigError(f"{shown} {NO_RUN_FOLDER}")
     if os.path.lexists(run.checkpoints) and not run.checkpoints.is_dir():
-        raise ConfigError(f"run.resume=auto: {run.checkpoints} is not a folder")
+        raise ConfigError(f"run.resume=auto: {nearby(run.checkpoints)} is not a folder")
     if not run.config.exists():
         return StartPoint(run)
     saved = config_of_run(run)
@@ -129,15 +129,27 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
     if found.checkpoint is None and found.broken:
         raise ConfigError(
             f"{shown}: {none_is_whole(found)}; to train anew, choose another folder or remove "
-            f"{run.checkpoints}"
+            f"{nearby(run.checkpoints)}"
         )
     changes = differences(saved, config).values()
     notes = (*found.passed_over, *(f"changed since the run: {text}" for text in changes))
     if found.checkpoint is None:
-        return StartPoint(run, notes=notes)
+        return StartPoint(run, notes=(*notes, *_begins_anew(run)))
     meta = _require_fit(config, found.checkpoint, saved, "auto")
     is_complete = meta.env_steps >= config.num_timesteps
     return StartPoint(run, found.checkpoint, is_complete, notes)
+
+
+def _begins_anew(run: RunPaths) -> tuple[str, ...]:
+    """Says what becomes of what was trained without a checkpoint; nothing where nothing was."""
+    if not (lines := read_metrics(run.metrics)):
+        return ()
+    steps = lines[-1]["env_steps"]
+    kept = nearby(run.earlier_metrics(steps))
+    return (
+        f"warning: no checkpoint in {nearby(run.root)}, training starts at step 0; the metrics of "
+        f"the {steps:,} steps before are kept in {kept}",
+    )
 
 
 def replay_line(config: TrainConfig, plan: Plan) -> tuple[str, ...]:

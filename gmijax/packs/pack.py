@@ -161,10 +161,14 @@ class PackWork(Work[CommandJob]):
 
     def state_of(self, run: RunPaths, job: CommandJob) -> State:
         """See `Work`."""
-        del job
         if not run.summary.exists():
             return "waiting"
-        return "completed" if read_json(run.summary).get("status") == "completed" else "waiting"
+        try:
+            status = read_json(run.summary).get("status")
+        except ConfigError as error:  # The program may not be one that may run twice.
+            why = str(error).replace(str(run.summary), nearby(run.summary))
+            raise ConfigError(f"{why}; remove it to run job {job.number} again") from None
+        return "completed" if status == "completed" else "waiting"
 
     def described(self) -> dict[str, Any]:
         """See `Work`."""

@@ -99,6 +99,10 @@ class RunPaths(_Folder):
         self.search_report = root / "search.json"
         self.search_png = root / "search.png"
 
+    def earlier_metrics(self, env_steps: int) -> Path:
+        """The metrics of a training that was begun anew here, after so many environment steps."""
+        return self.root / f"metrics-{steps_name(env_steps)}.jsonl"
+
     def checkpoint(self, env_steps: int) -> Path:
         """The checkpoint after `env_steps` environment steps."""
         return self.checkpoints / steps_name(env_steps)

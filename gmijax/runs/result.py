@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from gmijax.runs.folder import read_json
+from gmijax.errors import ConfigError
+from gmijax.runs.folder import RunPaths, read_json
+
+
+def summary_of(run: RunPaths) -> dict[str, Any]:
+    """The summary of a job; empty where there is none, or a damaged one.
+
+    No job goes on from it, and each writes its own, so a damaged one stands in nobody's way.
+    """
+    with suppress(ConfigError):
+        return read_json(run.summary)
+    return {}
 
 
 @dataclass(frozen=True, kw_only=True)

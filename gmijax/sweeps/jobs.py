@@ -11,8 +11,9 @@ from typing import Any, Literal
 from gmijax.config import BackendName, TrainConfig
 from gmijax.config.schema import flatten, to_dict
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.folder import RunPaths
 from gmijax.runs.names import nearby
+from gmijax.runs.result import summary_of
 from gmijax.runs.saved_config import config_of_run, differences
 from gmijax.sim import source
 from gmijax.sweeps.any_job import label_of
@@ -159,5 +160,5 @@ def require_same(run: RunPaths, config: TrainConfig) -> None:
 
 def _complete(run: RunPaths) -> Mapping[str, Any] | None:
     """The summary of a run that is complete, for however many steps; None: it is not."""
-    summary = read_json(run.summary) if run.summary.exists() else {}
+    summary = summary_of(run)
     return summary if summary.get("status") == "completed" else None

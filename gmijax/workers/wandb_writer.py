@@ -18,6 +18,7 @@ from typing import Any
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.history import MetricsReader, scalars
 from gmijax.runs.names import by_steps
+from gmijax.runs.result import summary_of
 from gmijax.supervise.side_process import exit_code_beside
 
 _POLL_S = 2.0
@@ -60,7 +61,7 @@ def follow(run: RunPaths, config: Mapping[str, Any]) -> None:
         if new or is_new:
             reached = {"env_steps": last, "filmed_env_steps": filmed}
             write_json(run.wandb, {"id": board.id, **reached})
-    summary = read_json(run.summary) if run.summary.exists() else {"status": "failed"}
+    summary = summary_of(run) or {"status": "failed"}
     board.summary.update(summary)
     board.finish(exit_code=int(summary["status"] == "failed"))
 

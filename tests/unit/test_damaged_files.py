@@ -14,6 +14,7 @@ import pytest
 from supervision import machine, planned, save, save_meta
 
 from gmijax.cli.compose import compose
+from gmijax.cli.pack import build_pack
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import open_console
@@ -165,16 +166,45 @@ def test_what_a_killed_writer_left_of_a_complete_run_is_removed(run: RunPaths, i
 
 
 def test_a_complete_run_with_damaged_files_is_one_line(run: RunPaths):
-    for summary in (b"{", b"[]"):
-        run.summary.write_bytes(summary)
-        with pytest.raises(ConfigError, match=f"^{run.summary}: broken"):
-            _finished(config_of(run), run, open_console(show=False))
-    run.summary.unlink()
+    run.plan.write_text("{")
+    with pytest.raises(ConfigError, match=f"^{run.plan}: broken"):
+        _finished(config_of(run), run, open_console(show=False))
     for plan in ({}, {"layout": 5}, {"layout": [[0]], "allocations": [{}]}, {"layout": [["a"]]}):
         write_json(run.plan, plan)
         with pytest.raises(ConfigError, match=f"^{run.plan}: (not a )?plan") as error:
             _finished(config_of(run), run, open_console(show=False))
         assert len(str(error.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("content", [b"{", b"[]", b"\xff"])
+def test_a_damaged_summary_is_written_anew(run: RunPaths, content: bytes):
+    write_json(run.plan, planned(machine(0), backend="cpu").to_dict())
+    config = config_of(run)
+    run.summary.write_bytes(content)
+    assert find_start_point(config).checkpoint == run.checkpoint(100)
+    assert state_of(run, config) == "waiting"
+    _finished(config, run, open_console(show=False))
+    assert read_json(run.summary)["status"] == "completed"
+
+
+def test_a_damaged_summary_does_not_make_a_folder_a_free_one(run: RunPaths):
+    run.summary.write_bytes(b"{")
+    with pytest.raises(ConfigError, match=r"already; run\.resume=auto continues"):
+        find_start_point(compose("env=ant", f"run.dir={run.root}"))
+
+
+def test_a_job_of_a_pack_with_a_damaged_summary_says_how_to_run_it_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """It is not run again by itself: the program may not be one that may run twice."""
+    monkeypatch.chdir(tmp_path)
+    run = RunPaths(tmp_path / "job_1")
+    run.root.mkdir()
+    run.summary.write_text("{")
+    pack = build_pack(["seed=1,2"], ["echo", "{seed}"])
+    said = r"^job_1/summary\.json: broken \(.*\); remove it to run job 1 again$"
+    with pytest.raises(ConfigError, match=said):
+        pack.state_of(run, pack.jobs[1])
 
 
 def test_a_run_without_a_seed_keeps_that_of_the_command(run: RunPaths):

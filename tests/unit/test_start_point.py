@@ -16,6 +16,7 @@ from gmijax.cli.compose import compose
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.config.schema import flatten, to_dict
 from gmijax.control import decide, serving
+from gmijax.control.run_folder import begin_again
 from gmijax.control.start_point import (
     find_start_point,
     forgotten,
@@ -25,6 +26,7 @@ from gmijax.control.start_point import (
 from gmijax.errors import ConfigError
 from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import META, RunPaths, create_run, read_json, write_json
+from gmijax.runs.history import read_metrics
 
 
 def config_of(folder: Path, *overrides: str) -> TrainConfig:
@@ -101,6 +103,36 @@ def test_auto_refuses_a_run_of_which_no_checkpoint_is_whole(run: RunPaths, damag
         find_start_point(config_of(run.root))
     shutil.rmtree(run.checkpoints)
     assert find_start_point(config_of(run.root))[:2] == (run, None)
+
+
+def test_auto_keeps_the_metrics_of_a_run_whose_checkpoints_are_gone(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(run.root.parent)
+    lines = '{"env_steps": 64}\n{"env_steps": 1280}\n'
+    run.metrics.write_text(lines)
+    beginning = find_start_point(config_of(run.root))
+    assert beginning[:2] == (run, None)
+    assert beginning.notes == (
+        "warning: no checkpoint in run, training starts at step 0; the metrics of the 1,280 steps "
+        "before are kept in run/metrics-000000001280.jsonl",
+    )
+    begin_again(run, None)
+    assert run.earlier_metrics(1280).read_text() == lines
+    assert read_metrics(run.metrics) == []
+    # Nothing was trained since.
+    assert find_start_point(config_of(run.root)).notes == ()
+    begin_again(run, None)
+    assert run.earlier_metrics(1280).read_text() == lines
+
+
+def test_auto_cuts_the_metrics_of_a_run_that_has_a_checkpoint(run: RunPaths):
+    checkpoint = save(run, 64)
+    run.metrics.write_text('{"env_steps": 64}\n{"env_steps": 128}\n')
+    assert find_start_point(config_of(run.root)).notes == ()
+    begin_again(run, checkpoint)
+    assert read_metrics(run.metrics) == [{"env_steps": 64}]
+    assert list(run.root.glob("metrics-*")) == []
 
 
 def test_a_file_in_place_of_the_checkpoints_is_found_before_anything_is_trained(run: RunPaths):
