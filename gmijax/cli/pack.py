@@ -37,7 +37,9 @@ class PackRun(KeyGroup):
     prefix = "run."
 
     dir: str | None = doc("folder of the pack; null: runs/pack-<date>-<time>")
-    name: str | None = doc("name of the folder below runs/ (ignored if run.dir is given)")
+    name: str | None = doc(
+        "name of the folder below runs/ (ignored if run.dir is given)", may_be_empty=True
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,8 +29,10 @@ _OF_THE_FILM: Final[Mapping[str, Any]] = MappingProxyType(
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayRunConfig:
+class PlayRunConfig(KeyGroup):
     """The run whose policy is played or exported."""
+
+    prefix = "run."
 
     dir: str | None = doc("run folder, or `last`; null: the run of `checkpoint`, else `last`")
     env: str | None = doc(

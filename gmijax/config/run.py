@@ -39,7 +39,9 @@ class RunConfig(Timeouts):
     """The run folder and the job's life."""
 
     dir: str | None = doc("run folder; null: runs/<env>-<algo>-<date>-<time>")
-    name: str | None = doc("name of the run folder below runs/ (ignored if run.dir is given)")
+    name: str | None = doc(
+        "name of the run folder below runs/ (ignored if run.dir is given)", may_be_empty=True
+    )
     resume: str | None = doc(
         "continue from a run folder, from one of its checkpoints, or from `last`, in a new run "
         "folder; auto: continue in run.dir if it has a checkpoint, else start"

@@ -28,14 +28,16 @@ def doc(
     low: float | None = None,
     high: float | None = None,
     positive: bool = False,
+    may_be_empty: bool = False,
 ) -> Any:
     """A dataclass field whose meaning `--help` prints; one with a default may be left out.
 
-    `KeyGroup` checks its limits: at least `low`, at most `high`, or greater than 0. A text that
-    may not be null may not be empty either.
+    `KeyGroup` checks its limits: at least `low`, at most `high`, or greater than 0. A text is not
+    empty, as of a variable that the shell does not have, unless it `may_be_empty`.
     """
     limits = (low, high, positive)
-    return dataclasses.field(metadata={"doc": text, "limits": limits}, default=default)
+    metadata = {"doc": text, "limits": limits, "may_be_empty": may_be_empty}
+    return dataclasses.field(metadata=metadata, default=default)
 
 
 class KeyGroup:
@@ -46,11 +48,17 @@ class KeyGroup:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(typing.cast("Any", self)):
             limits, found = field.metadata.get("limits"), getattr(self, field.name)
-            if field.type == "str" and not found.strip():
+            if isinstance(found, str) and not found.strip() and _must_say_something(field):
                 raise ConfigError(f"{self.prefix}{field.name}={found}: must not be empty")
             for value in found if isinstance(found, tuple) else (found,):
                 if limits and isinstance(value, int | float):
                     _require_limits(f"{self.prefix}{field.name}", value, *limits)
+
+
+def _must_say_something(field: dataclasses.Field[Any]) -> bool:
+    if field.type == "str | None":  # What has no `doc` no user gives.
+        return not field.metadata.get("may_be_empty", True)
+    return field.type == "str"
 
 
 def _require_limits(

@@ -26,7 +26,8 @@ class ServeRunConfig(Timeouts):
         "and without policy=random: `last`"
     )
     name: str | None = doc(
-        "name of the job's own folder below runs/; null: <env>-serve-<date>-<time>"
+        "name of the job's own folder below runs/; null: <env>-serve-<date>-<time>",
+        may_be_empty=True,
     )
 
     @property
@@ -36,8 +37,10 @@ class ServeRunConfig(Timeouts):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OutputConfig:
+class OutputConfig(KeyGroup):
     """What is written of the experience."""
+
+    prefix = "output."
 
     dir: str | None = doc("folder for the experience, made or continued; null: nothing is written")
     next_obs: bool = doc("write the observation before any reset too, to bootstrap from it")

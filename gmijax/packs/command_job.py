@@ -88,7 +88,7 @@ def jobs_of_file(settings: PackConfig) -> tuple[CommandJob, ...]:
     for number, line in enumerate(text.splitlines(), 1):
         try:
             words = shlex.split(line, comments=True)
-            require_names([*words, *templates_of(settings)], ())
+            require_names([*words, *templates_of(settings)], {})
         except (ValueError, ConfigError) as error:
             raise ConfigError(f"pack.commands={path}: line {number}: {error}") from None
         if words:

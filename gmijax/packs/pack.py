@@ -36,8 +36,11 @@ from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.progress import State
 from gmijax.sweeps.runner import SweepResult, run_work
 from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
-from gmijax.sweeps.space import Choices, Space, corners, grid
+from gmijax.sweeps.space import Choices, Interval, Space, corners, grid
 from gmijax.sweeps.work import Folder, Work
+
+_MOST_SHOWN = 4
+"""Values of a name in an error."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,13 @@ class PackWork(Work[CommandJob]):
     def ranking(self) -> PackConfig:
         """See `Work`."""
         return cast("PackConfig", self.settings)
+
+    @property
+    def stopping(self) -> str:
+        """See `Work`."""
+        # Whether a program saves then is its own affair.
+        stop = f"running jobs get SIG{self.ranking.stop_signal} and may take"
+        return f"{stop} {self.ranking.stop_timeout_s:g} s to end; a second {{}} ends them at once"
 
     @property
     def is_adaptive(self) -> bool:
@@ -184,6 +194,14 @@ class PackWork(Work[CommandJob]):
         return {"commands": [list(command) for command in commands], **self.grid_identity()}
 
 
+def _shown(values: Choices | Interval) -> str:
+    """Values of a name in an error, the first of many."""
+    if isinstance(values, Interval):
+        return f"interval({values.low:g},{values.high:g})"
+    more = ",..." if len(values.values) > _MOST_SHOWN else ""
+    return f"{','.join(values.values[:_MOST_SHOWN])}{more}"
+
+
 def pack_of(
     settings: PackConfig,
     space: Space,
@@ -224,7 +242,8 @@ def pack_of(
         raise ConfigError("no command: expected gmijax pack [NAME=VALUE,VALUE ...] -- COMMAND ...")
     if settings.copies is not None and space:
         raise ConfigError("pack.copies: not with a grid; leave out one of them")
-    require_names([*command, *templates_of(settings)], list(space))
+    names = {name: _shown(values) for name, values in space.items()}
+    require_names([*command, *templates_of(settings)], names)
     if empty := [key for key, values in space.items() if values == Choices(())]:
         raise ConfigError(f"{empty[0]}: an empty list")
     points = grid(space, "pack") if settings.sampler == "grid" else corners(space)

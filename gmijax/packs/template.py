@@ -7,7 +7,7 @@ they are: JSON and `${VARIABLE}` pass unharmed. `{{` and `}}` stand for single b
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from gmijax.config.schema import suggestion
@@ -51,23 +51,25 @@ def _filled(text: str, values: Mapping[str, str]) -> str:
     return _PARTS.sub(value_of, text)
 
 
-def require_names(arguments: Sequence[str], names: Collection[str]) -> None:
+def require_names(arguments: Sequence[str], names: Mapping[str, str]) -> None:
     """Refuses placeholders that nothing fills, and names of the grid that no placeholder uses.
 
     Args:
       arguments: all that may hold placeholders.
-      names: of the grid.
+      names: of the grid, with their values as they are shown.
 
     Raises:
       ConfigError: names the first.
     """
     found = placeholders(arguments)
-    for name in names:
+    for name, values in names.items():
         if name in OWN_NAMES:
-            raise ConfigError(f"{name}=: every job has {{{name}}} of its own; give another name")
+            raise ConfigError(
+                f"{name}={values}: every job has {{{name}}} of its own; give another name"
+            )
         if name not in found:
             raise ConfigError(
-                f"{name}=: the command has no {{{name}}}, so all jobs would be equal"
+                f"{name}={values}: the command has no {{{name}}}, so all jobs would be equal"
             )
     for name in found:
         if name not in names and name not in OWN_NAMES:

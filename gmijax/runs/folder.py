@@ -175,7 +175,7 @@ def create_run(run_dir: str | None, name: str | None, prefix: str) -> RunPaths:
     """
     given = given_run(run_dir, name)
     root = given or RUNS / f"{prefix}-{datetime.now():%Y%m%d-%H%M%S}"
-    key = "run.dir" if run_dir else "run.name"
+    shown = _as_given(run_dir, name, root)
     for attempt in range(100):
         # Two jobs started in the same second: only a name that we made up may be changed.
         candidate = root.with_name(f"{root.name}-{attempt}") if attempt and not given else root
@@ -185,9 +185,16 @@ def create_run(run_dir: str | None, name: str | None, prefix: str) -> RunPaths:
             require_new_run(run_dir, name)
             continue
         except OSError as error:
-            raise ConfigError(f"{key}={root}: cannot make the folder ({error.strerror})") from None
+            raise ConfigError(f"{shown}: cannot make the folder ({error.strerror})") from None
         return RunPaths(candidate.resolve())
-    raise ConfigError(f"{key}={root}: no free name")
+    raise ConfigError(f"{shown}: no free name")
+
+
+def _as_given(run_dir: str | None, name: str | None, root: Path) -> str:
+    """A run folder in an error: by the key that the user gave, if any."""
+    if run_dir:
+        return f"run.dir={root}"
+    return f"run.name={name} ({root})" if name else str(root)
 
 
 def replay_name(gmi: int | str) -> str:
@@ -233,8 +240,7 @@ def require_new_run(run_dir: str | None, name: str | None, hint: str = "") -> No
         what = "not a folder"
     elif holds_something_else(root, own=RunPaths(root).config, lock=RunPaths(root).lock):
         what = NO_RUN_FOLDER
-    key = "run.dir" if run_dir else "run.name"
-    raise ConfigError(f"{key}={root}: {what}")
+    raise ConfigError(f"{_as_given(run_dir, name, root)}: {what}")
 
 
 def holds_something_else(folder: Path, *, own: Path, lock: Path) -> bool:

@@ -70,7 +70,9 @@ def any_checkpoint(wanted: str, key: str) -> Path:
 
 
 def _no_checkpoint(folder: Path) -> str:
-    """Says that a folder has none, and where there are some if it is that of a sweep."""
+    """Says that a folder has none, and where there are some: in the run, in those of a sweep."""
+    if folder == RunPaths(folder.parent).checkpoints and checkpoints_of(folder.parent):
+        return f"no checkpoint in this folder; did you mean {folder.parent}?"
     jobs = sorted(path.name for path in _folders_in(folder) if checkpoints_of(path))
     if not jobs:
         return "no checkpoint in this folder"
@@ -80,21 +82,31 @@ def _no_checkpoint(folder: Path) -> str:
 
 
 def _named(wanted: str, key: str) -> Path:
+    if not wanted.strip():  # `Path` takes it for the working folder.
+        raise ConfigError(f"{key}={wanted}: must not be empty")
     folder = last_run(key) if wanted == "last" else Path(wanted)
     if not os.path.isdir(folder):  # Unlike `Path.is_dir` it takes any text.
-        near = "" if os.path.exists(folder) else _near_folder(folder)
+        near = "" if os.path.exists(folder) else _meant(wanted, key)
         raise ConfigError(f"{key}={wanted}: {why_no_folder(folder)}{near}")
     return folder
 
 
-def _near_folder(folder: Path) -> str:
-    """`; did you mean ...` for a name that is close to that of a folder beside it."""
+def _meant(wanted: str, key: str) -> str:
+    """`; did you mean ...` for a name that is close to that of a run, or to one that is a word."""
+    folder = Path(wanted)
+    if os.path.isdir(RUNS / folder):  # As `run.name` has it.
+        return f"; did you mean {RUNS / folder}?"
+    is_name = folder.parent == Path()
     try:
-        names = [path.name for path in _folders_in(folder.parent)]
+        places = [folder.parent, *([RUNS] if is_name else [])]
+        near = {path.name: str(path) for place in places for path in _folders_in(place)}
     except (OSError, ValueError):  # Not to be read, or no name that a folder can have.
-        return ""
-    close = difflib.get_close_matches(folder.name, names, n=1)
-    return f"; did you mean {folder.parent / close[0]}?" if close else ""
+        near = {}
+    if is_name:
+        words = ("last", "auto") if key == "run.resume" else ("last",)
+        near |= dict(zip(words, words, strict=True))
+    close = difflib.get_close_matches(folder.name, near, n=1)
+    return f"; did you mean {near[close[0]]}?" if close else ""
 
 
 def last_run(key: str) -> Path:

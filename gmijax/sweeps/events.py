@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, TextIO
 
@@ -63,6 +64,10 @@ class JobEvents:
         """After the last job."""
         self.update()
         found = {key: report.get(key) for key in ("status", "ranking", "settings", "wall_s")}
+        states = [job.progress.state for job in self._jobs]
+        failed = [job.number for job in self._jobs if job.progress.state == "failed"]
+        # By state, and by number those that somebody may have to mend.
+        found |= {"jobs": dict(Counter(states)), "failed": failed}
         self._write(f"{self._name}_ended", **found)
 
     def _started(self, job: AnyJob) -> None:

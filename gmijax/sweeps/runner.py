@@ -93,7 +93,7 @@ def _run(
         report = JobsReport(jobs, work.ranking, work.described, paths, folder, started_s)
         report.begin()
     console.print(f"{work.name} folder: {nearby(paths.root)}")
-    view = SweepView(console, jobs, work.ranking)
+    view = SweepView(console, jobs, work.ranking, work.stopping)
     job_events = JobEvents(events, work.name, jobs, paths)
     try:
         with errors_of_files(paths):

@@ -48,6 +48,11 @@ class SweepWork(Work[Job]):
     resume_requirement = "lists"
 
     @property
+    def stopping(self) -> str:
+        """See `Work`."""
+        return "running jobs save and end; a second {} ends them at once, without saving"
+
+    @property
     def ranking(self) -> SweepConfig:
         """See `Work`."""
         return cast("SweepConfig", self.settings)

@@ -21,7 +21,6 @@ _HEADINGS = (
     *("job", "overrides", "GPU and slot", "progress", "steps/s", "{}", "ranked by", "ETA"),
     "state",
 )
-_STOPPING = "stopping: running jobs save and end; a second {} ends them at once, without saving"
 _MOST_ROWS = 30
 _BAR_WIDTH = 6
 _LONG_LABEL = 80
@@ -35,10 +34,14 @@ class SweepView:
       console: nothing is shown on a quiet one.
       jobs: those that are known; more may be added to the list.
       ranking: what they are compared by.
+      stopping: what is said of running jobs once a signal has come, whose name stands for `{}`.
     """
 
-    def __init__(self, console: Console, jobs: Sequence[AnyJob], ranking: Ranking) -> None:
+    def __init__(
+        self, console: Console, jobs: Sequence[AnyJob], ranking: Ranking, stopping: str
+    ) -> None:
         self._console, self._jobs, self._ranking = console, jobs, ranking
+        self._stopping = stopping
         self._stages: dict[int, tuple[str, int, str | None]] = {}
         self._named: set[int] = set()
         self._left: defaultdict[int, TimeLeft] = defaultdict(TimeLeft)
@@ -57,7 +60,7 @@ class SweepView:
         """Called about ten times a second; `stopped_by`: as of `GmiStatus`."""
         if stopped_by and not self._is_stopping:
             self._is_stopping = True
-            self._console.print(_STOPPING.format(stopped_by))
+            self._console.print(f"stopping: {self._stopping.format(stopped_by)}")
         self._display.show(self._show)
 
     def line(self) -> str:

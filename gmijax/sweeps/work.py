@@ -65,6 +65,11 @@ class Work(ABC, Generic[J]):
         """What jobs are compared by."""
 
     @property
+    @abstractmethod
+    def stopping(self) -> str:
+        """What becomes of running jobs once a signal has come, whose name stands for `{}`."""
+
+    @property
     def is_adaptive(self) -> bool:
         """Whether the number at once changes while jobs run."""
         return False

@@ -17,7 +17,7 @@ from training_jobs import train
         ("serve", ["policy=random", "num_envs=0"], "num_envs=0: must be at least 1"),
         ("play", [], "run.dir=last: no run with a checkpoint"),
         ("export", [], "run.dir=last: no run with a checkpoint"),
-        ("pack", ["seed=0,1", "--", "true", "{sed}"], "seed=: the command has no {seed}"),
+        ("pack", ["seed=0,1", "--", "true", "{sed}"], "seed=0,1: the command has no {seed}"),
         ("doctor", ["gpu=x"], "gpu=x: expected one of --json"),
     ],
 )

@@ -143,6 +143,17 @@ REFUSED: list[tuple[str, str, str]] = [
     ("view", "view.port=70000", "view.port=70000: must be between 0 and 65535"),
     ("view", "view.allow_origin=[hub]", "'hub' is no origin; expected e.g. https://"),
     ("view", "view.host=''", "view.host=: must not be empty"),
+    *(
+        (command, f"{words} run.dir=", "run.dir=: must not be empty")
+        for command, words in (
+            *(("train", ""), ("search", ""), ("play", ""), ("export", ""), ("view", "")),
+            *(("serve", "policy=random"), ("sweep", "seed=0,1"), ("pack", "pack.copies=2")),
+        )
+    ),
+    ("train", "run.resume=", "run.resume=: must not be empty"),
+    ("train", "run.resume=auto run.name=x run.dir=''", "run.dir=: must not be empty"),
+    ("train", "wandb.group=", "wandb.group=: must not be empty"),
+    ("serve", "policy=random output.dir=", "output.dir=: must not be empty"),
     ("train", "algo.=1", "algo.=1: a name is missing before or after a dot of the key"),
     ("train", "run.name=../x", "run.name=../x: expected a name below runs/"),
     ("train", "run.name=.", "run.name=.: expected a name below runs/"),

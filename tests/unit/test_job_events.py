@@ -51,5 +51,20 @@ def test_a_job_starts_once_in_each_attempt():
     ]
 
 
+def test_the_end_counts_the_jobs_and_names_those_that_failed():
+    stream = io.StringIO()
+    jobs: list[Any] = [
+        SimpleNamespace(number=number, overrides={}, num_timesteps=None, progress=Progress())
+        for number in range(4)
+    ]
+    events = JobEvents(stream, "pack", jobs, SweepPaths(Path("all")))
+    for job, state in zip(jobs, ("completed", "failed", "completed", "failed"), strict=True):
+        job.progress.state = state
+    events.end({"status": "failed"})
+    last = json.loads(stream.getvalue().splitlines()[-1])
+    assert (last["event"], last["status"]) == ("pack_ended", "failed")
+    assert (last["jobs"], last["failed"]) == ({"completed": 2, "failed": 2}, [1, 3])
+
+
 def test_a_job_that_was_never_started_ends_without_a_start():
     assert events_of(Progress(), {"state": "interrupted"}) == [("job_ended", None)]

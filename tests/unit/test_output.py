@@ -17,8 +17,9 @@ from rich.console import Console
 from rich.text import Text
 from supervision import CHECKOUT, machine
 
+from gmijax.cli.grid import build_sweep
+from gmijax.cli.pack import build_pack
 from gmijax.config import PlanConfig, ReduceConfig
-from gmijax.config.sweep import SweepConfig
 from gmijax.control import phases, progress, time_left
 from gmijax.control.console import Show, announce, doing, nearby, open_console, print_next
 from gmijax.control.display import LiveDisplay
@@ -319,11 +320,21 @@ def test_a_stop_names_the_signal_that_asked_for_it():
     asked = GmiStatus(0, "stopping", 3, None, None, signals.name)
     ConsoleProgress(Console(file=said, width=300), list, 10).update((asked,))
     assert "a second SIGTERM ends at once" in said.getvalue()
-    said = io.StringIO()
-    view = SweepView(Console(file=said, width=300), [], SweepConfig())
-    for _ in range(2):
-        view.update(signals.name)
-    assert said.getvalue().count("a second SIGTERM ends them at once") == 1
+
+
+def test_a_pack_does_not_say_that_programs_of_others_save():
+    sweep = build_sweep(["env=ant", "seed=0,1"])
+    pack = build_pack(["pack.stop_signal=INT", "seed=0,1"], ["echo", "{seed}"])
+    lines = []
+    for work in (sweep, pack):
+        said = io.StringIO()
+        view = SweepView(Console(file=said, width=300), [], work.ranking, work.stopping)
+        for _ in range(2):
+            view.update("SIGTERM")
+        lines.append(said.getvalue())
+    saves, ends = (line.removeprefix("stopping: running jobs ").rstrip() for line in lines)
+    assert saves == "save and end; a second SIGTERM ends them at once, without saving"
+    assert ends == "get SIGINT and may take 25 s to end; a second SIGTERM ends them at once"
 
 
 def test_figures_of_before_a_restart_are_not_shown_while_it_compiles_again():

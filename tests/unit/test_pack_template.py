@@ -35,19 +35,25 @@ def test_placeholders_are_named_once_in_order():
 @pytest.mark.parametrize(
     ("arguments", "names", "message"),
     [
-        (["{sed}"], ["seed"], r"seed=: the command has no \{seed\}"),
-        (["{seed}", "{sead}"], ["seed"], r"\{sead\}: no such placeholder: did you mean seed\?"),
-        (["{nothing}"], [], r"\{nothing\}: no such placeholder; allowed: job, run_dir"),
-        (["{job}"], ["job"], r"job=: every job has \{job\} of its own"),
+        (["{sed}"], {"seed": "0,1"}, r"^seed=0,1: the command has no \{seed\}"),
+        (
+            ["{seed}", "{sead}"],
+            {"seed": "0"},
+            r"\{sead\}: no such placeholder: did you mean seed\?",
+        ),
+        (["{nothing}"], {}, r"\{nothing\}: no such placeholder; allowed: job, run_dir"),
+        (["{job}"], {"job": "5"}, r"^job=5: every job has \{job\} of its own"),
     ],
 )
-def test_names_and_placeholders_must_fit(arguments: list[str], names: list[str], message: str):
+def test_names_and_placeholders_must_fit(
+    arguments: list[str], names: dict[str, str], message: str
+):
     with pytest.raises(ConfigError, match=message):
         require_names(arguments, names)
 
 
 def test_own_names_need_not_be_used():
-    require_names(["train.py", "--seed", "{seed}"], ["seed"])
+    require_names(["train.py", "--seed", "{seed}"], {"seed": "0"})
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,13 @@ from gmijax.errors import ConfigError, NoCheckpointYet
 from gmijax.runs.checkpoints import CheckpointMeta, file_check, newest_checkpoint
 from gmijax.runs.folder import META, RunPaths, read_json, write_json
 from gmijax.runs.held import locked
-from gmijax.runs.resume import choose_checkpoint, find_checkpoint, last_run, unsaved_runs
+from gmijax.runs.resume import (
+    any_checkpoint,
+    choose_checkpoint,
+    find_checkpoint,
+    last_run,
+    unsaved_runs,
+)
 from gmijax.runs.saved_config import left_out, trained_config
 
 
@@ -282,3 +288,32 @@ def test_a_misspelt_run_folder_is_answered_with_the_one_beside_it(tmp_path: Path
     for name, said in (("tinny", r"no such folder; did you mean .*tiny\?$"), ("x" * 9, "folder$")):
         with pytest.raises(ConfigError, match=said):
             find_checkpoint(str(tmp_path / name), "run.dir")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "key", "meant"),
+    [
+        ("5", "run.dir", "runs/5"),
+        ("5", "run.resume", "runs/5"),
+        ("lsat", "run.resume", "last"),
+        ("lsat", "run.dir", "last"),
+        ("atuo", "run.resume", "auto"),
+        ("ant-one", "run.dir", "runs/ant-1"),
+        ("runs/ant-one", "run.dir", "runs/ant-1"),
+        ("runs/5/checkpoints", "run.resume", "runs/5"),
+        ("atuo", "run.dir", None),
+        ("somewhere/lsat", "run.dir", None),
+        ("runs/lsat", "run.dir", None),
+    ],
+)
+def test_a_name_that_is_no_folder_is_answered_with_what_is_meant(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wanted: str, key: str, meant: str | None
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ("5", "ant-1"):
+        make_run(Path("runs") / name, 100)
+    for find in (find_checkpoint, any_checkpoint):
+        with pytest.raises(ConfigError, match=f"^{key}={wanted}: no ") as error:
+            find(wanted, key)
+        hint = "" if meant is None else f"did you mean {meant}?"
+        assert str(error.value).partition("; ")[2] == hint

@@ -89,6 +89,28 @@ def test_a_run_whose_name_is_a_number_keeps_its_settings(
     assert compose(*line, "num_envs=8").num_envs == 8
 
 
+@pytest.mark.parametrize(
+    ("left", "said"),
+    [
+        ("config.json", "the run folder exists already; run.resume=auto continues in it"),
+        ("thesis.tex", "is not a run folder, and is not empty"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("named", "shown"),
+    [("run.name=5", "run.name=5 (runs/5)"), ("run.dir=runs/5", "run.dir=runs/5")],
+)
+def test_a_folder_that_is_refused_is_named_as_it_was_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: str, said: str, named: str, shown: str
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "5").mkdir(parents=True)
+    (tmp_path / "runs" / "5" / left).touch()
+    with pytest.raises(ConfigError) as error:
+        find_start_point(compose("env=ant", named))
+    assert str(error.value) == f"{shown}: {said}"
+
+
 @pytest.mark.parametrize("damage", ["cut", "missing"])
 def test_auto_refuses_a_run_of_which_no_checkpoint_is_whole(run: RunPaths, damage: str):
     for steps in (100, 200):
@@ -305,7 +327,9 @@ def test_serve_refuses_a_name_that_is_taken_before_it_searches(
     monkeypatch.setattr(decide, "with_auto_decided", search)
     overrides = ("policy=random", "num_envs=auto", "run.name=mine")
     config = compose(*overrides, command="serve")
-    with pytest.raises(ConfigError, match=r"^run\.name=runs/mine: the run folder exists already$"):
+    with pytest.raises(
+        ConfigError, match=r"^run\.name=mine \(runs/mine\): the run folder exists already$"
+    ):
         serving.serve(config)
 
 

@@ -67,7 +67,7 @@ def view_on(stream: Any, jobs: list[Job]) -> SweepView:
     console = Console(
         file=stream, force_terminal=stream.isatty(), width=160, markup=False, color_system=None
     )
-    return SweepView(console, jobs, SWEEP)
+    return SweepView(console, jobs, SWEEP, "{}")
 
 
 def test_the_table_says_of_each_job_where_and_how_far_it_is() -> None:
@@ -173,7 +173,7 @@ def test_an_error_of_the_view_ends_the_view_alone(
     monkeypatch.setattr(display, "REFRESH_S", 0.0)
     terminal, jobs = Terminal(), running_jobs()
     monkeypatch.setattr(sys, "stdout", terminal)
-    with SweepView(open_console(show=True), jobs, SWEEP) as view:
+    with SweepView(open_console(show=True), jobs, SWEEP, "{}") as view:
         view.update()
         if what == "a terminal that is closed":
             terminal.is_closed_by_user = True
@@ -235,7 +235,7 @@ def test_the_table_hides_nothing_of_an_override() -> None:
     overrides = ("algo.learning_rate=0.00012345", "env.settings.goal_height_m=0.75")
     jobs = list(jobs_of([compose("num_timesteps=1000", *overrides), compose()]))
     jobs[0].progress.state = "running"
-    view = SweepView(open_console(show=False), jobs, SWEEP)
+    view = SweepView(open_console(show=False), jobs, SWEEP, "{}")
     text = {}
     for width in (80, 120):
         said = io.StringIO()
