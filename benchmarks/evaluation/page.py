@@ -44,8 +44,7 @@ def gains() -> dict[str, Gains]:
         "off_policy": {STEPS: beside_a_learner()},
         "fixed_total": {STEPS: [*fixed_total_ratios().values()]},
         "best_plans": {STEPS: [*best_plan_ratios().values()]},
-        "two_gpus": {STEPS: [over_one_gpu(2)]},
-        "four_gpus": {STEPS: [over_one_gpu(4)]},
+        "two_gpus": {STEPS: [over_one_gpu()]},
         **{
             f"asynchronous_{gpus}": {
                 STEPS: asynchronous_gains(gpus, TRAINING),

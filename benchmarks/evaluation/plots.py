@@ -61,7 +61,7 @@ SUMMARY = MappingProxyType(
             "mjlab": "8 of mjlab's Go1",
             "cleanrl": "8 of CleanRL's PPO",
         },
-        "processes under MPS, over plain sharing": {"mps": "2 to 8 that serve"},
+        "processes under MPS, over plain sharing": {"mps": "2 and 8 that serve"},
         "8 trainings in 8 processes, over one program": {"program": "8 of ant"},
         "one training in several GMIs, over one process": {
             "off_policy": "SAC, agent + learner",

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
 
 from benchmarks.cases import PLANS, TASKS
 from benchmarks.evaluation.evidence import Ratio
 from benchmarks.evaluation.figures import (
     Figure,
     busy_sms,
-    figure,
     measured,
     over,
     rate,
     ratio,
-    results_of,
     shown,
-    sources_of,
     summaries,
 )
 from benchmarks.evaluation.paper import LGR, lgr_gain
@@ -26,70 +22,38 @@ from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import select_strategy
 
 LAYOUTS = {"2G2T": "2 GPUs x 2", "2G3T": "2 GPUs x 3", "4G4T": "4 GPUs x 4"}
-TWO_TREES, SCALING = "exchange-in-program-h200", "scaling"
-WEAK = (SCALING, "scaling-4gpu", "scaling-one_shot")
-"""Files of weak scaling; with several names, one after the other."""
+SCALING = "scaling"
 
 
 def scaling(gpus: int, gmis: int) -> str:
-    """The name of a case of `WEAK`."""
+    """The name of a case of `SCALING`."""
     return f"{gpus} GPUs x {gmis} GMIs x {8192 // gmis}"
 
 
-ONE_GPU = (
-    *(
-        (f"{gmis} GMIs, MJX-Warp", file, scaling(1, gmis), scaling(1, 1))
-        for file in (SCALING, "scaling-one_shot")
-        for gmis in (2, 4)
-    ),
-    ("2 GMIs, MJX-Warp", TWO_TREES, "2x4096", "1x8192"),
-    ("4 GMIs, MJX-Warp", TWO_TREES, "4x2048", "1x8192"),
-    ("4 GMIs, MJX-JAX", "ant-1gpu", "4 GMIs x 2048, mps", "1 GMI x 8192"),
+WEAK = (
+    *((SCALING, gmis, {gpus: scaling(gpus, gmis) for gpus in (1, 2, 4)}) for gmis in (1, 2)),
+    ("async-long", 1, {1: "1 GPU, synchronous", 2: "2 GPUs, synchronous"}),
 )
-"""What, file, several GMIs, one process: ant, 8192 environments on a GPU, under MPS."""
+"""File, GMIs on each GPU, and its cases by the number of GPUs: ant, 8192 environments on each."""
+
+ONE_GPU = tuple((f"{gmis} GMIs", scaling(1, gmis), scaling(1, 1)) for gmis in (2, 4))
+"""What, several GMIs, one process: ant, 8192 environments on a GPU, under MPS."""
 
 OTHERS = (
-    ("4 GMIs, MJX-JAX, no MPS", "ant-1gpu", "4 GMIs x 2048, share", "1 GMI x 8192"),
-    ("4 GMIs, MJX-Warp, no MPS", SCALING, f"{scaling(1, 4)}, share", scaling(1, 1)),
-    ("2 GPUs, 2 GMIs on each, MJX-Warp", TWO_TREES, "2gpu-2x4096", "2gpu-1x8192"),
-    *(
-        (f"{gpus} GPUs, 2 GMIs on each, MJX-Warp", SCALING, scaling(gpus, 2), scaling(gpus, 1))
-        for gpus in (2, 4)
-    ),
+    ("4 GMIs, no MPS", f"{scaling(1, 4)}, share", scaling(1, 1)),
+    *((f"{gpus} GPUs, 2 GMIs on each", scaling(gpus, 2), scaling(gpus, 1)) for gpus in (2, 4)),
 )
 """The same without MPS, and on more GPUs against one process on each."""
 
-BACKENDS = (
-    *(
-        (scaling(gpus, gmis), "MJX-Warp", SCALING, scaling(gpus, gmis))
-        for gpus, gmis in ((1, 4), (2, 2))
-    ),
-    ("4 GMIs x 2048", "MJX-JAX", "ant-1gpu", "4 GMIs x 2048, mps"),
-    ("2 GPUs x 2 GMIs x 2048", "MJX-JAX", "ant-2gpu", "2 GPUs x 2 GMIs x 2048, mps"),
-)
-"""What, physics, file, case under MPS; that of plain sharing ends with `share`."""
-
-IN_GPU_MEMORY = ("one_shot", "auto")
-"""Exchanges that do not pass the host: `auto` where a file does not say what it became."""
+BACKENDS = ((1, 4), (2, 2))
+"""GPUs, and GMIs on each: cases under MPS, and under plain sharing."""
 
 TEMPLATES = ("2 GMIs x 2048, tcg_ex", "2 + 1 GMIs x 2048, tdg_ex")
 
 
 def pair(file: str, case: str, base: str) -> tuple[Figure | None, Figure | None]:
     """Steps/s of two cases, of one call."""
-    if file != TWO_TREES:
-        return rate(file, case), rate(file, base)
-    # Two trees in each of its own calls; the old one has all cases.
-    for one in results_of(file).get("calls", ()):
-        if {case, base} <= one["cases"].keys():
-            several, alone = (
-                figure(
-                    [run["steps_per_s"] for run in one["cases"][name]["base"]], *sources_of(file)
-                )
-                for name in (case, base)
-            )
-            return several, alone
-    return None, None
+    return rate(file, case), rate(file, base)
 
 
 def compared(one: Figure | None, base: Figure | None) -> list[str]:
@@ -99,30 +63,24 @@ def compared(one: Figure | None, base: Figure | None) -> list[str]:
 
 def exchange_of(file: str, case: str) -> str:
     """By which strategy the GMIs of a case exchanged gradients."""
-    found = summaries(file, case)
-    return found[0]["plan"]["strategy"] if found else "auto"
+    return str(summaries(file, case)[0]["plan"]["strategy"])
 
 
 def fixed_total_ratios() -> dict[str, Ratio]:
-    """Several GMIs on one GPU over one process with as many environments, as jobs exchange now."""
-    return {
-        f"{what} ({file})": gain
-        for what, file, case, base in ONE_GPU
-        if exchange_of(file, case) in IN_GPU_MEMORY
-        and (gain := over(*pair(file, case, base))) is not None
-    }
+    """Several GMIs on one GPU over one process with as many environments."""
+    return {what: gain for what, *cases in ONE_GPU if (gain := ratio(SCALING, *cases)) is not None}
 
 
 @table(
     "fixed-total",
-    "on each GPU | exchange | GMIs, steps/s: | one process, steps/s: | ratio: | file",
-    more=lambda: measured(file for _, file, *_ in (*ONE_GPU, *OTHERS)),
+    "on each GPU | exchange | GMIs, steps/s: | one process, steps/s: | ratio:",
+    SCALING,
 )
 def fixed_total() -> Rows:
     """The same environments in one process on each GPU, and in several."""
-    for what, file, case, base in (*ONE_GPU, *OTHERS):
-        if all(found := pair(file, case, base)):
-            yield [what, f"`{exchange_of(file, case)}`", *compared(*found), f"`{file}`"]
+    for what, case, base in (*ONE_GPU, *OTHERS):
+        if all(found := pair(SCALING, case, base)):
+            yield [what, f"`{exchange_of(SCALING, case)}`", *compared(*found)]
 
 
 def fastest(task: str, *, several: bool) -> tuple[Figure, str] | None:
@@ -159,35 +117,37 @@ def best_plans() -> Rows:
 
 @table(
     "training-backends",
-    "ant | MJX | exchange | `mps`, steps/s: | `share`, steps/s: | ratio:",
-    more=lambda: measured(file for _, _, file, _ in BACKENDS),
+    "GPUs x GMIs x environments | exchange | `mps`, steps/s: | `share`, steps/s: | ratio:",
+    SCALING,
 )
 def training_backends() -> Rows:
-    """MPS against plain sharing, in training."""
-    for what, impl, file, mps in BACKENDS:
-        if all(found := pair(file, mps, f"{mps.removesuffix(', mps')}, share")):
-            yield [what, impl, f"`{exchange_of(file, mps)}`", *compared(*found)]
+    """MPS against plain sharing, in training of ant."""
+    for gpus, gmis in BACKENDS:
+        mps = scaling(gpus, gmis)
+        if all(found := pair(SCALING, mps, f"{mps}, share")):
+            size = f"{gpus} x {gmis} x {8192 // gmis:,}"
+            yield [size, f"`{exchange_of(SCALING, mps)}`", *compared(*found)]
 
 
 @table(
     "weak-scaling",
-    "GPUs x GMIs x environments | exchange | steps/s: | over one GPU: | of ideal:",
-    more=lambda: measured(WEAK),
+    "GPUs x GMIs x environments | steps/s: | over one GPU: | of ideal:",
+    more=lambda: measured(file for file, _, cases in WEAK if rate(file, cases[2])),
 )
 def weak_scaling() -> Rows:
     """8192 environments on every GPU."""
-    for file, gmis, gpus in product(WEAK, (1, 2), (1, 2, 4)):
-        name, way = scaling(gpus, gmis), exchange_of(file, scaling(2, gmis))
-        gain = ratio(file, name, scaling(1, gmis))
-        has_several = rate(file, scaling(2, gmis)) is not None
-        if gain and has_several and (gmis == 1 or way in IN_GPU_MEMORY):
-            cells = [shown(rate(file, name), ",.0f"), shown(gain), shown(gain / gpus)]
-            yield [f"{gpus} x {gmis} x {8192 // gmis:,}", f"`{way}`", *cells]
+    for file, gmis, cases in WEAK:
+        if rate(file, cases[2]) is None:
+            continue
+        for gpus, name in cases.items():
+            if gain := ratio(file, name, cases[1]):
+                cells = [shown(rate(file, name), ",.0f"), shown(gain), shown(gain / gpus)]
+                yield [f"{gpus} x {gmis} x {8192 // gmis:,}", *cells]
 
 
-def over_one_gpu(gpus: int) -> Ratio | None:
-    """Steps/s of several GPUs with one GMI on each, over those of one GPU."""
-    gains = (ratio(file, scaling(gpus, 1), scaling(1, 1)) for file in WEAK)
+def over_one_gpu() -> Ratio | None:
+    """Steps/s of two GPUs with one GMI on each, over those of one GPU."""
+    gains = (ratio(file, cases[2], cases[1]) for file, gmis, cases in WEAK if gmis == 1)
     return next((gain for gain in gains if gain), None)
 
 
@@ -241,9 +201,9 @@ def algorithm_1(at: str) -> str:
 def with_and_without(task: str, at: str, way: str) -> tuple[Figure | None, Figure | None]:
     """Steps/s of a reduction on a layout, and of `mpr`: of the same call where that has both."""
     pairs = [(rate(file, f"{at} {way}"), rate(file, f"{at} mpr")) for file in measured(_lgr(task))]
-    own, mpr = ([one for one in side if one] for side in zip(*pairs, strict=True))
-    alone = (own[0] if own else None, mpr[0] if mpr else None)
-    return next((pair for pair in pairs if all(pair)), alone)
+    own = next((own for own, _ in pairs if own), None)
+    mpr = next((mpr for _, mpr in pairs if mpr), None)
+    return next((pair for pair in pairs if all(pair)), (own, mpr))
 
 
 def _lgr(task: str) -> tuple[str, ...]:
