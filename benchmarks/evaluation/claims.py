@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from benchmarks.cases import REWARD
 from benchmarks.evaluation.async_tables import KEYS, LONG, learners_over_one
-from benchmarks.evaluation.evidence import Ratio, Said, joined
-from benchmarks.evaluation.figures import TRAINING, ratio, said, said_bounds
+from benchmarks.evaluation.evidence import Ratio, Said
+from benchmarks.evaluation.figures import TRAINING, joined, ratio, said, said_bounds
 from benchmarks.evaluation.learning_tables import seconds_over_one_process
 from benchmarks.evaluation.node_tables import two_nodes_over_one
 from benchmarks.evaluation.other_tables import model_fit, searched

@@ -101,10 +101,3 @@ def together(parts: Iterable[Evidence]) -> Evidence | None:
         return None
     sources = frozenset[Source]().union(*(one.sources for one in found))
     return Evidence(min(one.repeats for one in found), sources)
-
-
-def joined(between: str, parts: Iterable[Said]) -> Said:
-    """Several, with something between two of them."""
-    found = list(parts)
-    evidence = together(one.evidence for one in found if one.evidence)
-    return Said(between.join(one.text for one in found), evidence)

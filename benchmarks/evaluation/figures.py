@@ -143,6 +143,15 @@ def said_bounds(values: Sequence[Figure | Ratio | None], form: str = ".2f") -> S
     return Said(bounds(medians, form), together(value.evidence for value in found))
 
 
+def joined(between: str, parts: Iterable[Said]) -> Said:
+    """Several, with something between two of them; if none was measured, only that."""
+    found = list(parts)
+    evidence = together(one.evidence for one in found if one.evidence)
+    if evidence is None:
+        return Said(NOT_MEASURED, None)
+    return Said(between.join(one.text for one in found), evidence)
+
+
 def _count(results: Mapping[str, Any]) -> int:
     """How much was measured: cases with runs, or rows of whatever the suite has."""
     lists = [results.get(key, ()) for key in ("cases", "rows", "points", "runs", "tasks")]

@@ -17,13 +17,10 @@ from matplotlib.transforms import blended_transform_factory
 
 from benchmarks.evaluation.evidence import LEAST, Ratio
 from benchmarks.evaluation.figures import Figure
-from benchmarks.evaluation.page import FINISHED, STEPS, gains
-from benchmarks.evaluation.paper import LGR, lgr_gain
-from benchmarks.evaluation.tables import LAYOUTS, reduction_gain
+from benchmarks.evaluation.page import FINISHED, gains
 from gmijax.runs.folder import write_text
 
 FOLDER = Path(__file__).parents[2] / "docs" / "img"
-PAPER = "paper"
 
 
 class Bar(NamedTuple):
@@ -33,7 +30,7 @@ class Bar(NamedTuple):
       name: to its left; empty: it belongs to the one above.
       low: its end.
       high: of a range, the other end.
-      kind: `STEPS`, `FINISHED` or `PAPER`.
+      kind: `STEPS` or `FINISHED`.
       is_sure: whether commit, date and three runs back it.
     """
 
@@ -47,7 +44,7 @@ class Bar(NamedTuple):
 Groups = dict[str, list[Bar]]
 """Heading -> the bars below it."""
 
-LEFT_OF_ONE, AROUND_ONE, RIGHT_OF_ONE, OF_THE_PAPER = "#c55", "#ca4", "#2a7", "#999"
+LEFT_OF_ONE, AROUND_ONE, RIGHT_OF_ONE = "#c55", "#ca4", "#2a7"
 
 PALE = (
     "right of 1 is a gain; a thin line goes from the lowest case to the highest\n"
@@ -91,18 +88,6 @@ def summary() -> Groups:
     }
 
 
-def lgr() -> Groups:
-    """LGR here and in the paper."""
-    groups: Groups = {}
-    for task in LGR:
-        bars = groups.setdefault(task, [])
-        for at, name in LAYOUTS.items():
-            bars += _bar(name, STEPS, [reduction_gain(task, at, "one_shot")])
-            gain = lgr_gain(task, at)
-            bars.append(Bar(f"{name}, {PAPER}", gain, gain, PAPER, is_sure=True))
-    return groups
-
-
 def _bar(name: str, kind: str, found: Sequence[Figure | Ratio | None]) -> Iterator[Bar]:
     """Of what was measured, if anything."""
     measured = [one for one in found if one is not None]
@@ -118,7 +103,6 @@ PICTURES: MappingProxyType[str, tuple[Callable[[], Groups], str]] = MappingProxy
             summary,
             "times the steps/s; hatched: times the trainings per hour\n" + PALE,
         ),
-        "evaluation-lgr": (lgr, "times the steps/s of mpr\n" + PALE),
     }
 )
 """Name -> its bars, and what their length is."""
@@ -182,8 +166,6 @@ def _draw_bar(axes: Axes, at: int, bar: Bar) -> None:
 
 
 def _colour(bar: Bar) -> str:
-    if bar.kind == PAPER:
-        return OF_THE_PAPER
     return RIGHT_OF_ONE if bar.low >= 1 else LEFT_OF_ONE if bar.high < 1 else AROUND_ONE
 
 

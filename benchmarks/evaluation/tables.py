@@ -199,16 +199,8 @@ def algorithm_1(at: str) -> str:
 
 
 def with_and_without(task: str, at: str, way: str) -> tuple[Figure | None, Figure | None]:
-    """Steps/s of a reduction on a layout, and of `mpr`: of the same call where that has both."""
-    pairs = [(rate(file, f"{at} {way}"), rate(file, f"{at} mpr")) for file in measured(_lgr(task))]
-    own = next((own for own, _ in pairs if own), None)
-    mpr = next((mpr for _, mpr in pairs if mpr), None)
-    return next((pair for pair in pairs if all(pair)), (own, mpr))
-
-
-def _lgr(task: str) -> tuple[str, ...]:
-    """Files of a task; those with more in their names are of single strategies."""
-    return tuple(f"lgr-{task}{way}" for way in ("", "-one_shot", "-mrr"))
+    """Steps/s of a reduction on a layout, and of `mpr`."""
+    return pair(f"lgr-{task}", f"{at} {way}", f"{at} mpr")
 
 
 def reduction_gain(task: str, at: str, way: str) -> Ratio | None:
@@ -220,7 +212,7 @@ def reduction_gain(task: str, at: str, way: str) -> Ratio | None:
     "lgr",
     "task | GMIs | exchange | by Algorithm 1 | `mpr`, steps/s: | steps/s: | ratio: | "
     "the paper's LGR:",
-    more=lambda: measured(file for task in LGR for file in _lgr(task)),
+    *(f"lgr-{task}" for task in LGR),
 )
 def lgr() -> Rows:
     """Every reduction that was measured in training against `mpr`."""

@@ -23,6 +23,9 @@ MakeValues = TypeVar("MakeValues", bound=Callable[[], Values])
 TABLES: dict[str, Callable[[], list[str]]] = {}
 """By the name that documents use: `<!-- table: NAME -->`."""
 
+_NOTHING = [NOT_MEASURED]
+"""A table without a file of results."""
+
 SAID: dict[str, Callable[[], list[tuple[str, Evidence | None]]]] = {}
 """Of tables of words: every line, with what its figures are of."""
 
@@ -40,8 +43,9 @@ def table(
     """
 
     def make(rows: MakeRows) -> list[str]:
-        found = [*rows()]
-        return [*markdown(head, found), *source(*files, *more())] if found else [NOT_MEASURED]
+        found, below = [*rows()], [*files, *more()]
+        is_measured = not below or any(map(call_of, below))
+        return [*markdown(head, found), *source(*below)] if found and is_measured else _NOTHING
 
     def register(rows: MakeRows) -> MakeRows:
         TABLES[name] = lambda: make(rows)
@@ -71,7 +75,7 @@ def table_of_calls(
     def register(rows: MakeRowsOfCalls) -> MakeRowsOfCalls:
         def make() -> list[str]:
             if not (found := find()):
-                return [NOT_MEASURED]
+                return _NOTHING
             made = made_with(found, note)
             below = dict.fromkeys(made) if is_brief else made
             return [*markdown(head, [*rows(found)]), "", *below]
@@ -125,10 +129,22 @@ def words(name: str) -> Callable[[MakeValues], MakeValues]:
 
 def _filled(line: str, values: Values) -> tuple[str, Evidence | None]:
     """A line with figures in the places of their names; `{on}` is what they are of."""
-    names = [name for _, name, *_ in Formatter().parse(line) if name and name != "on"]
-    found = [Formatter().get_field(name, (), values)[0] for name in names]
-    evidence = together(one.evidence for one in found if one.evidence)
-    return line.format(**values, on=evidence or ""), evidence
+    evidence = together(one.evidence for one in _named(line, values) if one.evidence)
+    cells = (_filled_cell(cell, {**values, "on": evidence or ""}) for cell in line.split("|"))
+    return "|".join(cells), evidence
+
+
+def _filled_cell(cell: str, values: Mapping[str, Any]) -> str:
+    """A cell whose figures are all missing says so once."""
+    found = _named(cell, values)
+    is_missing = found and all(one.text == NOT_MEASURED for one in found)
+    return f" {NOT_MEASURED} " if is_missing else cell.format(**values)
+
+
+def _named(text: str, values: Mapping[str, Any]) -> list[Said]:
+    """The figures that a text names, but for `{on}`."""
+    names = (name for _, name, *_ in Formatter().parse(text) if name and name != "on")
+    return [Formatter().get_field(name, (), values)[0] for name in names]
 
 
 def markdown(head: str, rows: Sequence[Sequence[str]]) -> list[str]:

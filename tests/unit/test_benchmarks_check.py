@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from benchmarks import records
 from benchmarks.cases import SUITES
 from benchmarks.evaluation import check, figures, tables
 from benchmarks.evaluation.async_tables import over_the_same_ratio
 from benchmarks.evaluation.count import of_figure, of_table
 from benchmarks.evaluation.figures import look_up
 from benchmarks.evaluation.page import TABLES
+from benchmarks.evaluation.sweep_tables import FINISHED, STEPS, processes_over_program
 from gmijax.errors import ConfigError
 
 REFERENCE = "runs.json#four, mps/step_per_s_train"
@@ -61,14 +64,51 @@ def test_lgr_is_what_algorithm_1_of_the_paper_takes():
     assert {at: tables.algorithm_1(at) for at in tables.LAYOUTS} == taken
 
 
-def test_reductions_are_compared_in_one_call_if_one_has_both(results: Path):
-    write_results(results, "lgr-ant", {"2G2T mpr": runs(100.0)})
-    write_results(results, "lgr-ant-mrr", {"2G2T mrr": runs(50.0)})
-    assert tables.reduction_gain("ant", "2G2T", "mrr") == 0.5
-    assert tables.reduction_gain("ant", "2G2T", "one_shot") is None
-    both = {"2G2T mpr": runs(200.0), "2G2T one_shot": runs(300.0)}
-    write_results(results, "lgr-ant-one_shot", both)
-    assert tables.reduction_gain("ant", "2G2T", "one_shot") == 1.5
+def test_scaling_is_that_of_the_file_with_two_gpus(results: Path):
+    one, two = tables.scaling(1, 1), tables.scaling(2, 1)
+    assert tables.over_one_gpu() is None
+    write_results(results, "scaling", {one: runs(100.0)})
+    long = {"1 GPU, synchronous": runs(50.0), "2 GPUs, synchronous": runs(90.0)}
+    write_results(results, "async-long", long)
+    assert tables.over_one_gpu() == 1.8
+    assert [row[0] for row in tables.weak_scaling()] == ["1 x 1 x 8,192", "2 x 1 x 8,192"]
+    write_results(results, "scaling", {one: runs(100.0), two: runs(195.0)})
+    assert tables.over_one_gpu() == 1.95
+
+
+def sweeps(date: str, **rates: Sequence[float]) -> dict[str, Any]:
+    found = [
+        {"way": f"8 at once, {way}", "status": "completed", FINISHED: rate, STEPS: rate}
+        for way, of_way in rates.items()
+        for rate in of_way
+    ]
+    settings = {"overrides": ["env=ant"], "jobs": 8, "warm": True}
+    own = {"commit": "1234567", "date": date, "device": "1 x NVIDIA H200"}
+    return {**own, "settings": settings, "results": {"runs": found}}
+
+
+def test_processes_and_a_program_are_compared_in_one_call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    calls = [
+        sweeps("2026-11-24", auto=[50.0, 50.0], vmap=[60.0]),
+        sweeps("2026-11-29", auto=[80.0, 81.0, 82.0], vmap=[90.0, 90.0, 99.0]),
+        sweeps("2026-11-30", auto=[10.0] * 9),
+    ]
+    file = {"format": 2, "calls": calls}
+    (tmp_path / "sweeps-nvidia-h200.json").write_text(json.dumps(file))
+    monkeypatch.setattr(records, "RESULTS", tmp_path)
+    gain = processes_over_program(STEPS)
+    assert gain is not None
+    assert gain == 0.9
+    assert gain.evidence.repeats == 3
+
+
+@pytest.mark.usefixtures("results")
+def test_what_no_file_has_is_said_once():
+    assert TABLES["lgr"]() == ["not measured"]
+    (row,) = (line for line in TABLES["claims"]() if "LGR over MPR" in line)
+    assert row.split(" | ")[4:6] == ["not measured", ""]
 
 
 def test_every_table_stands_in_one_page_of_the_evaluation():
