@@ -100,15 +100,15 @@ def processes_over_program(key: str) -> Ratio | None:
 
     Of one call: the one with the most sweeps, of those the newest.
     """
-    best: tuple[int, int, Ratio] | None = None
-    for same in same_jobs().values():
-        rates = same.of_calls(key)
-        for call in {call for call, _ in rates}:
-            both = (rates.get((call, f"8 at once, {way}")) for way in ("auto", "vmap"))
-            if gain := over(*both):
-                found = (gain.evidence.repeats, call, gain)
-                best = found if best is None else max(best, found, key=lambda one: one[:2])
-    return best and best[2]
+    rates = [same.of_calls(key) for same in same_jobs().values()]
+    found = [
+        (gain.evidence.repeats, call, gain)
+        for of_calls in rates
+        for call, way in of_calls
+        if way == "8 at once, vmap"
+        and (gain := over(of_calls.get((call, "8 at once, auto")), of_calls[call, way]))
+    ]
+    return max(found, key=lambda one: one[:2])[2] if found else None
 
 
 @lines("sweeps")

@@ -61,9 +61,9 @@ def compared(one: Figure | None, base: Figure | None) -> list[str]:
     return [*(shown(value, ",.0f") for value in (one, base)), shown(over(one, base))]
 
 
-def exchange_of(file: str, case: str) -> str:
-    """By which strategy the GMIs of a case exchanged gradients."""
-    return str(summaries(file, case)[0]["plan"]["strategy"])
+def _exchange_of(case: str) -> str:
+    """By which strategy the GMIs of a case of `SCALING` exchanged gradients."""
+    return f"`{summaries(SCALING, case)[0]['plan']['strategy']}`"
 
 
 def fixed_total_ratios() -> dict[str, Ratio]:
@@ -80,7 +80,7 @@ def fixed_total() -> Rows:
     """The same environments in one process on each GPU, and in several."""
     for what, case, base in (*ONE_GPU, *OTHERS):
         if all(found := pair(SCALING, case, base)):
-            yield [what, f"`{exchange_of(SCALING, case)}`", *compared(*found)]
+            yield [what, _exchange_of(case), *compared(*found)]
 
 
 def fastest(task: str, *, several: bool) -> tuple[Figure, str] | None:
@@ -126,7 +126,7 @@ def training_backends() -> Rows:
         mps = scaling(gpus, gmis)
         if all(found := pair(SCALING, mps, f"{mps}, share")):
             size = f"{gpus} x {gmis} x {8192 // gmis:,}"
-            yield [size, f"`{exchange_of(SCALING, mps)}`", *compared(*found)]
+            yield [size, _exchange_of(mps), *compared(*found)]
 
 
 @table(
@@ -198,14 +198,14 @@ def algorithm_1(at: str) -> str:
     return select_strategy(Layout.even(int(gpus), int(gmis))).strategy
 
 
-def with_and_without(task: str, at: str, way: str) -> tuple[Figure | None, Figure | None]:
-    """Steps/s of a reduction on a layout, and of `mpr`."""
-    return pair(f"lgr-{task}", f"{at} {way}", f"{at} mpr")
+def _with_and_without(at: str, way: str) -> tuple[str, str]:
+    """The cases of a reduction on a layout, and of `mpr`."""
+    return f"{at} {way}", f"{at} mpr"
 
 
 def reduction_gain(task: str, at: str, way: str) -> Ratio | None:
-    """The ratio of the two."""
-    return over(*with_and_without(task, at, way))
+    """Steps/s of the one over those of the other."""
+    return ratio(f"lgr-{task}", *_with_and_without(at, way))
 
 
 @table(
@@ -219,7 +219,8 @@ def lgr() -> Rows:
     for task in LGR:
         for way in ("one_shot", "mrr", "har"):
             for at in LAYOUTS:
-                chosen, found = way == algorithm_1(at), with_and_without(task, at, way)
+                chosen = way == algorithm_1(at)
+                found = pair(f"lgr-{task}", *_with_and_without(at, way))
                 if not chosen and found[0] is None:
                     continue
                 paper = f"{lgr_gain(task, at):.2f}" if chosen else "-"

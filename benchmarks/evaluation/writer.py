@@ -23,9 +23,6 @@ MakeValues = TypeVar("MakeValues", bound=Callable[[], Values])
 TABLES: dict[str, Callable[[], list[str]]] = {}
 """By the name that documents use: `<!-- table: NAME -->`."""
 
-_NOTHING = [NOT_MEASURED]
-"""A table without a file of results."""
-
 SAID: dict[str, Callable[[], list[tuple[str, Evidence | None]]]] = {}
 """Of tables of words: every line, with what its figures are of."""
 
@@ -44,8 +41,9 @@ def table(
 
     def make(rows: MakeRows) -> list[str]:
         found, below = [*rows()], [*files, *more()]
-        is_measured = not below or any(map(call_of, below))
-        return [*markdown(head, found), *source(*below)] if found and is_measured else _NOTHING
+        if not found or (below and not any(map(call_of, below))):
+            return [NOT_MEASURED]
+        return [*markdown(head, found), *source(*below)]
 
     def register(rows: MakeRows) -> MakeRows:
         TABLES[name] = lambda: make(rows)
@@ -75,7 +73,7 @@ def table_of_calls(
     def register(rows: MakeRowsOfCalls) -> MakeRowsOfCalls:
         def make() -> list[str]:
             if not (found := find()):
-                return _NOTHING
+                return [NOT_MEASURED]
             made = made_with(found, note)
             below = dict.fromkeys(made) if is_brief else made
             return [*markdown(head, [*rows(found)]), "", *below]
