@@ -188,7 +188,7 @@ SUITES = MappingProxyType(
             for task in (TASKS if num_envs == 8192 else ("ant", "humanoid"))
         ),
         # Figure 9.
-        "reward": tuple(_reward(task, gmis) for task in REWARD for gmis in (1, 4)),
+        **{f"reward-{task}": (_reward(task, 1), _reward(task, 4)) for task in REWARD},
         **{f"lgr-{task}": _lgr(task) for task in ("ant", "humanoid", "shadow_hand")},
         "scaling": (
             *(_scaling(1, gmis) for gmis in (1, 2, 4)),

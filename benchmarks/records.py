@@ -2,7 +2,6 @@
 
 A file holds calls. A call is one command on one machine, with the code and the machine that it was
 made with, and the suite's own results. Another call is added to the file; nothing is overwritten.
-A file from before this format is read as one call, and what it does not say is unknown.
 """
 
 from __future__ import annotations
@@ -141,14 +140,14 @@ def read_calls(path: Path) -> list[Call]:
     """The calls in a file, oldest first.
 
     Raises:
-      ConfigError: there is no such file.
+      ConfigError: there is no such file, or it has another format.
     """
     if not path.exists():
         raise ConfigError(f"{path}: no such file of results")
     found = read_json(path)
-    if found.get("format") == FORMAT:
-        return [Call(**call) for call in found["calls"]]
-    return [_of_old_file(found)]
+    if found.get("format") != FORMAT:
+        raise ConfigError(f"{path}: format={found.get('format')}: expected {FORMAT}")
+    return [Call(**call) for call in found["calls"]]
 
 
 def add_calls(files: Sequence[Path], results: Path = RESULTS) -> None:
@@ -235,25 +234,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [_plain(one) for one in value]
     return value
-
-
-def _of_old_file(found: Mapping[str, Any]) -> Call:
-    """An old file says little of where it is from; summaries of runs in it name the device."""
-    summaries = list(_summaries(found))
-    kinds = dict.fromkeys(one["device"]["kind"] for one in summaries if one.get("device"))
-    versions = next((s["versions"] for s in summaries if s.get("versions")), None)
-    device = found.get("device") or ", ".join(kinds) or found.get("machine")
-    known = {key: found.get(key) for key in ("commit", "date", "host", "driver", "command")}
-    trees = [tree for tree in found.get("trees", {}).values() if isinstance(tree, str)]
-    known["commit"] = known["commit"] or ", ".join(trees) or None
-    return Call(
-        **known, device=device, versions=found.get("versions") or versions, results=dict(found)
-    )
-
-
-def _summaries(found: Any) -> Iterator[Mapping[str, Any]]:
-    if isinstance(found, Mapping) and "summary" in found:
-        yield found["summary"]
-    elif isinstance(found, Mapping | list):
-        for part in found.values() if isinstance(found, Mapping) else found:
-            yield from _summaries(part)

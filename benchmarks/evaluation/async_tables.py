@@ -54,7 +54,7 @@ def asynchronous() -> Rows:
 @table(
     LEARNERS,
     "ant, SAC | PPS: | over one GPU: | TTOP, transitions drawn a second: | over one GPU: "
-    "| the paper's A3C, PPS / TTOP: | seconds to nine tenths of one GPU's return:",
+    "| seconds to nine tenths of one GPU's return:",
     LEARNERS,
 )
 def several_learners() -> Rows:
@@ -65,10 +65,9 @@ def several_learners() -> Rows:
         found = times_to(NEARLY * final.median, LEARNERS, case) if final else []
         seconds = figure([one for one in found if one is not None])
         acting, drawn = rate(LEARNERS, case), _drawn(case)
-        paper = "1 / 1" if case == base else "1.88 / 1.65"
         yield [
             *(case, shown(acting, ",.0f"), shown(over(acting, rate(LEARNERS, base)))),
-            *(shown(drawn, ",.0f"), shown(over(drawn, _drawn(base))), paper),
+            *(shown(drawn, ",.0f"), shown(over(drawn, _drawn(base)))),
             shown(seconds, ".1f"),
         ]
 

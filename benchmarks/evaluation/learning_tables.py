@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from benchmarks.cases import REWARD, TASKS
 from benchmarks.evaluation.evidence import Ratio
 from benchmarks.evaluation.figures import (
+    NOT_MEASURED,
     RATES,
     Figure,
     bounds,
@@ -27,24 +28,21 @@ NEARLY = 0.9
 """Of a return, that is reached more surely than all of it."""
 
 MARKS = (
-    ("ant", 3000, "20 s", (("async-long", "1 GPU, synchronous"),)),
-    (
-        *("humanoid", 5000, "under 240 s"),
-        (("reward", "humanoid 1 x 8192"), ("learn-humanoid", "humanoid")),
-    ),
+    ("ant", 3000, "20 s", ("async-long", "1 GPU, synchronous")),
+    ("humanoid", 5000, "under 240 s", ("reward-humanoid", "humanoid 1 x 8192")),
 )
-"""Task, return, what Isaac Gym publishes for it on an A100 (arXiv:2108.10470); files and cases."""
+"""Task, return, what Isaac Gym publishes for it on an A100 (arXiv:2108.10470); file and case."""
 
 
 @table(
     "marks",
     "task | return: | runs that reached it: | seconds, here: | Isaac Gym, on an A100:",
-    more=lambda: [_first(runs)[0] for *_, runs in MARKS],
+    *(file for *_, (file, _) in MARKS),
 )
 def marks() -> Rows:
     """Seconds from the first report of a run alone on its GPU to a return that others publish."""
-    for task, mark, published, runs in MARKS:
-        found = times_to(mark, *_first(runs))
+    for task, mark, published, case in MARKS:
+        found = times_to(mark, *case)
         reached = [seconds for seconds in found if seconds is not None]
         share = f"{len(reached)} of {len(found)}"
         yield [task, f"{mark:,}", share, shown(figure(reached), ".1f"), published]
@@ -52,15 +50,9 @@ def marks() -> Rows:
 
 def seconds_to_mark(task: str) -> Figure | None:
     """Seconds of training until a task reaches the return that Isaac Gym's authors give."""
-    ((mark, runs),) = ((mark, runs) for name, mark, _, runs in MARKS if name == task)
-    file, case = _first(runs)
+    ((mark, (file, case)),) = ((mark, case) for name, mark, _, case in MARKS if name == task)
     times = [s for s in times_to(mark, file, case) if s is not None]
     return figure(times, *sources_of(file))
-
-
-def _first(runs: Sequence[tuple[str, str]]) -> tuple[str, str]:
-    """The first file and case that were measured, else the last."""
-    return next((one for one in runs if rate(*one)), runs[-1])
 
 
 def times_to(mark: float, file: str, case: str) -> list[float | None]:
@@ -76,15 +68,23 @@ def _gmis(task: str) -> tuple[str, str]:
     return one, four
 
 
-def _seconds_alike(task: str) -> tuple[float | None, list[Figure | None]]:
-    """Nine tenths of what one process reaches, and seconds to it in one process and in GMIs."""
-    one, four = _gmis(task)
-    if (final := rate("reward", one, "final_return")) is None:
-        return None, [None, None]
+def _seconds_alike(task: str) -> tuple[float | None, list[Figure | None], list[str]]:
+    """Nine tenths of what one process reaches; seconds to it in one process and in GMIs, in words.
+
+    Runs that never reach it have no seconds; the words say how many those are.
+    """
+    file, cases = f"reward-{task}", _gmis(task)
+    if (final := rate(file, cases[0], "final_return")) is None:
+        return None, [None, None], [NOT_MEASURED] * 2
     mark = NEARLY * final.median
-    seconds = (times_to(mark, "reward", case) for case in (one, four))
-    reached = ([s for s in found if s is not None] for found in seconds)
-    return mark, [figure(found, *sources_of("reward")) for found in reached]
+    found = [times_to(mark, file, case) for case in cases]
+    reached = [[s for s in seconds if s is not None] for seconds in found]
+    figures = [figure(seconds, *sources_of(file)) for seconds in reached]
+    words = [
+        shown(one, ".1f") + (f", {len(did)} of {len(of)} runs" if len(did) < len(of) else "")
+        for one, did, of in zip(figures, reached, found, strict=True)
+    ]
+    return mark, figures, words
 
 
 def seconds_over_one_process(task: str) -> Ratio | None:
@@ -97,14 +97,14 @@ def seconds_over_one_process(task: str) -> Ratio | None:
     "reward",
     "task | return at the end, one process: | four GMIs: | mark: | seconds to it, one process: | "
     "four GMIs: | ratio:",
-    "reward",
+    *(f"reward-{task}" for task in REWARD),
 )
 def reward() -> Rows:
     """The same training in one process and in four GMIs of the GPU."""
     for task in REWARD:
-        mark, seconds = _seconds_alike(task)
-        finals = (shown(rate("reward", case, "final_return"), ",.0f") for case in _gmis(task))
-        cells = (shown(one, ".1f") for one in seconds)
+        mark, _, cells = _seconds_alike(task)
+        file = f"reward-{task}"
+        finals = (shown(rate(file, case, "final_return"), ",.0f") for case in _gmis(task))
         gain = shown(seconds_over_one_process(task))
         yield [f"`{task}`", *finals, shown(mark, ",.0f"), *cells, gain]
 

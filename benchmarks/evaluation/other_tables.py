@@ -30,34 +30,30 @@ from benchmarks.records import RESULTS, Call, calls_by_date, read_calls
 def _searches() -> Calls:
     """By task, the newest call that searched it."""
     found: dict[str, tuple[Call, Path]] = {}
-    for call, path in calls_by_date("search*.json"):
-        rows = call.results.get("rows") or [call.results]  # An old file is one search.
-        found |= {row["env"]: (call, path) for row in rows if "best" in row}
+    for call, path in calls_by_date("searches-*.json"):
+        found |= {row["env"]: (call, path) for row in call.results["rows"] if "best" in row}
     return found
 
 
-def searched() -> dict[str, Said]:
+def searched() -> Said:
     """What the searches on one GPU chose, each once, and how long they took."""
     sources = frozenset(source(path.stem, call) for call, path in _searches().values())
     rows = answers()
-    evidence = Evidence(1, sources) if rows else None
+    if not rows:
+        return Said(NOT_MEASURED, None)
     chosen = (
         f"`{task}` {best['gmis_per_gpu']} x {best['num_envs']:,} ({best['impl']})"
         for task, best in ((task, row["best"]) for task, row in rows.items())
     )
     seconds = bounds([row["wall_s"] for row in rows.values()], ".0f")
-    return {
-        "answers": Said(", ".join(chosen) or NOT_MEASURED, evidence),
-        "search_s": Said(f"{seconds} s", evidence),
-    }
+    return Said(f"{', '.join(chosen)}; {seconds} s", Evidence(1, sources))
 
 
 def answers() -> dict[str, Mapping[str, Any]]:
     """What the newest search of each task found."""
     rows = {}
     for task, (call, _) in sorted(_searches().items()):
-        searched = call.results.get("rows") or [call.results]
-        rows[task] = next(row for row in searched if row.get("env") == task)
+        rows[task] = next(row for row in call.results["rows"] if row.get("env") == task)
     return rows
 
 

@@ -62,6 +62,7 @@ def _of_trainings() -> Calls:
     "training | at once | steps/s while all report: | over one: | trainings per hour: | "
     "over one: | reward at the end:",
     _of_trainings,
+    lambda training: training,
 )
 def packs(calls: Calls) -> Rows:
     """Steps per second and trainings per hour of every training, by number at once."""

@@ -1,7 +1,7 @@
-"""Refuses what few runs or no commit back, unless `benchmarks/plan.md` names a call to repeat it.
+"""Refuses files without a commit, and figures of few runs that `benchmarks/plan.md` does not name.
 
-On the front page nothing of that kind may stand. The plan has two tables of files: those without a
-commit, and those with a commit that have one or two runs of what a row says.
+On the front page no figure of few runs may stand. The plan has a table of files that have one or
+two runs of what a row says.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from benchmarks.evaluation.page import SAID
 from benchmarks.records import RESULTS, read_calls
 
 PLAN = Path(__file__).parents[1] / "plan.md"
-WITHOUT_COMMIT, SELDOM = "| files |", f"| files with fewer than {LEAST} runs |"
-"""Heads of the plan's tables of files."""
+SELDOM = f"| files with fewer than {LEAST} runs |"
+"""Head of the plan's table of files."""
 STRICT = "front"
 """The table of the front page."""
 
@@ -25,25 +25,16 @@ Words = Mapping[str, Callable[[], list[tuple[str, Evidence | None]]]]
 """Tables of words: their lines, with what their figures are of."""
 
 
-def without_commit(results: Path = RESULTS, plan: Path = PLAN) -> Iterator[Finding]:
-    """Files without a commit that the plan does not name, and the reverse."""
-    planned = _planned(plan.read_text(), WITHOUT_COMMIT)
+def without_commit(results: Path = RESULTS) -> Iterator[Finding]:
+    """Files with a call of which the commit is not known."""
     for path in sorted(results.glob("*.json")):
-        has_commit = all(call.commit for call in read_calls(path))
-        if (line := planned.pop(path.stem, None)) is None and not has_commit:
-            yield Finding(
-                path.name, 1, path.stem, f"has no commit, and {plan.name} has no row of it"
-            )
-        elif line is not None and has_commit:
-            yield Finding(plan.name, line, path.stem, "has a commit: its row is done")
-    for name, line in planned.items():
-        yield Finding(plan.name, line, name, "there is no such file of results")
+        if not all(call.commit for call in read_calls(path)):
+            yield Finding(path.name, 1, path.stem, "has a call without a commit")
 
 
 def unplanned(said: Words = SAID, plan: Path = PLAN) -> Iterator[Finding]:
-    """Rows that few runs or no commit back and the plan does not name, and the reverse."""
-    text = plan.read_text()
-    seldom, old = _planned(text, SELDOM), _planned(text, WITHOUT_COMMIT)
+    """Rows of few runs that the plan does not name, and files that it names without need."""
+    seldom = _planned(plan.read_text())
     needed: set[str] = set()
     for table, rows in said.items():
         for number, (line, evidence) in enumerate(rows(), 1):
@@ -54,7 +45,7 @@ def unplanned(said: Words = SAID, plan: Path = PLAN) -> Iterator[Finding]:
             if table == STRICT:
                 wanted = f"the front page wants commit and {LEAST} runs, and this is {evidence}"
                 yield Finding(f"table {table}", number, line, wanted)
-            elif missing := sorted(files - {*seldom, *old}):
+            elif missing := sorted(files - {*seldom}):
                 lacks = f"is {evidence}, and {plan.name} has no row of {', '.join(missing)}"
                 yield Finding(f"table {table}", number, line, lacks)
     for name, at in seldom.items():
@@ -62,9 +53,9 @@ def unplanned(said: Words = SAID, plan: Path = PLAN) -> Iterator[Finding]:
             yield Finding(plan.name, at, name, "no row says figures of so few runs: it is done")
 
 
-def _planned(text: str, head: str) -> dict[str, int]:
-    """Names of files in the first column of a table, and the lines where they stand."""
-    if (found := re.search(f"^{re.escape(head)}", text, re.MULTILINE)) is None:
+def _planned(text: str) -> dict[str, int]:
+    """Names of files in the first column of the table, and the lines where they stand."""
+    if (found := re.search(f"^{re.escape(SELDOM)}", text, re.MULTILINE)) is None:
         return {}
     begin, end = found.start(), text.find("\n## ", found.start())
     rows = re.finditer(r"^\|([^|]*)\|", text[begin : None if end < 0 else end], re.MULTILINE)

@@ -1,10 +1,10 @@
-"""Training runs per hour of sweeps."""
+"""Sweeps: steps/s and trainings per hour by how many jobs run at once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias
 
 from benchmarks.evaluation.evidence import Ratio, Source, source
 from benchmarks.evaluation.figures import NOT_MEASURED, Figure, figure, over, shown
@@ -12,87 +12,68 @@ from benchmarks.evaluation.writer import line_of, lines, markdown
 from benchmarks.records import Call, calls_by_date
 
 PATTERN = "sweeps-nvidia-*.json"
-ONE_AFTER_ANOTHER = "1 at once, auto"
+ONE, EIGHT, PROGRAM = "1 at once, auto", "8 at once, auto", "8 at once, vmap"
 STEPS, FINISHED = "steady_steps_per_s", "trainings_per_hour"
 KEYS = MappingProxyType({"steps": STEPS, "finished": FINISHED})
 HEAD = (
-    "at once | sweeps: | runs per hour: | over one after another: | over plain sharing: | "
-    "steps/s in all:"
+    "commit | at once | steps/s in all: | over one after another: | over one program: "
+    "| trainings per hour: | over one after another: | over one program:"
 )
 
 Run: TypeAlias = Mapping[str, Any]
-Key = TypeVar("Key")
 
 
-class SameJobs(NamedTuple):
-    """Sweeps of the same jobs on the same GPU; a call has time for one of each way or so.
+class SweepsOfCall(NamedTuple):
+    """The sweeps of one call, all of the same jobs.
 
     Attributes:
-      calls: that ran them, as lines of Markdown.
-      runs: the number of the call, the way, and what succeeded in it.
-      sources: the calls.
+      commit: of the code.
+      line: the call, in Markdown.
+      made_by: the call.
+      ways: what succeeded, by how many ran at once and how.
     """
 
-    calls: list[str]
-    runs: list[tuple[int, str, Run]]
-    sources: list[Source]
+    commit: str
+    line: str
+    made_by: Source
+    ways: dict[str, list[Run]]
 
-    def rates(self, key: str = FINISHED) -> dict[str, Figure]:
-        """A figure of all sweeps, by way."""
-        return _figures(((way, run[key]) for _, way, run in self.runs), self.sources)
+    def rate(self, way: str, key: str) -> Figure | None:
+        """The median over its sweeps of one way."""
+        values = [run[key] for run in self.ways.get(way, ()) if run[key] is not None]
+        return figure(values, self.made_by)
 
-    def gains(self, key: str = FINISHED) -> dict[str, Figure]:
-        """A figure over that of one after another, each ratio of one call."""
-        return self._ratios(lambda way: ONE_AFTER_ANOTHER, key)
-
-    def gains_over_sharing(self) -> dict[str, Figure]:
-        """Jobs per hour over those of as many at once under plain sharing."""
-        return self._ratios(lambda way: way.replace(", auto", ", share"), FINISHED)
-
-    def of_calls(self, key: str) -> dict[tuple[int, str], Figure]:
-        """Figures by call and way."""
-        return _figures((((call, way), run[key]) for call, way, run in self.runs), self.sources)
-
-    def _ratios(self, base_of: Callable[[str], str], key: str) -> dict[str, Figure]:
-        of_call = self.of_calls(key)
-        gains = (
-            (way, found.median / of_call[number, base].median)
-            for (number, way), found in of_call.items()
-            if (base := base_of(way)) != way and (number, base) in of_call
-        )
-        return _figures(gains, self.sources)
+    def gain(self, way: str, base: str, key: str) -> Ratio | None:
+        """One way over another."""
+        return None if way == base else over(self.rate(way, key), self.rate(base, key))
 
 
-def _figures(
-    values: Iterable[tuple[Key, float | None]], sources: Sequence[Source]
-) -> dict[Key, Figure]:
-    """Those with the same key together, without what has no value."""
-    together: dict[Key, list[float]] = {}
-    for key, value in values:
-        if value is not None:
-            together.setdefault(key, []).append(value)
-    return {key: median for key, found in together.items() if (median := figure(found, *sources))}
-
-
-def same_jobs() -> dict[str, SameJobs]:
+def same_jobs() -> dict[str, list[SweepsOfCall]]:
     """By what the jobs are and where they ran, in Markdown; in the order of first calls."""
-    found: dict[str, SameJobs] = {}
-    for number, (call, path) in enumerate(calls_by_date(PATTERN)):
+    found: dict[str, list[SweepsOfCall]] = {}
+    for call, path in calls_by_date(PATTERN):
+        by_jobs: dict[str, dict[str, list[Run]]] = {}
         for run in call.results["runs"]:
             at_once, backend, *tasks = run["way"].split(", ")
             if run["status"] == "completed":
-                same = found.setdefault(_described(call, tasks), SameJobs([], [], []))
-                if number not in {one for one, *_ in same.runs}:
-                    same.calls.append(line_of(path.name, call))
-                    same.sources.append(source(path.stem, call))
-                same.runs.append((number, f"{at_once}, {backend}", run))
+                ways = by_jobs.setdefault(_described(call, tasks), {})
+                ways.setdefault(f"{at_once}, {backend}", []).append(run)
+        for jobs, ways in by_jobs.items():
+            one = SweepsOfCall(
+                (call.commit or "unknown")[:8],
+                line_of(path.name, call),
+                source(path.stem, call),
+                ways,
+            )
+            found.setdefault(jobs, []).append(one)
     return found
 
 
 def eight_at_once(key: str) -> Figure | None:
-    """What eight of the jobs of the first call gain at once, over one after another."""
-    gains = next((same.gains(key) for same in same_jobs().values()), {})
-    return gains.get("8 at once, auto")
+    """What eight of the first jobs gain at once, over one after another, by call."""
+    calls = next(iter(same_jobs().values()), [])
+    gains = [(gain, one.made_by) for one in calls if (gain := one.gain(EIGHT, ONE, key))]
+    return figure([gain for gain, _ in gains], *(made_by for _, made_by in gains))
 
 
 def processes_over_program(key: str) -> Ratio | None:
@@ -100,39 +81,47 @@ def processes_over_program(key: str) -> Ratio | None:
 
     Of one call: the one with the most sweeps, of those the newest.
     """
-    rates = [same.of_calls(key) for same in same_jobs().values()]
     found = [
-        (gain.evidence.repeats, call, gain)
-        for of_calls in rates
-        for call, way in of_calls
-        if way == "8 at once, vmap"
-        and (gain := over(of_calls.get((call, "8 at once, auto")), of_calls[call, way]))
+        (gain.evidence.repeats, number, gain)
+        for calls in same_jobs().values()
+        for number, one in enumerate(calls)
+        if (gain := one.gain(EIGHT, PROGRAM, key))
     ]
     return max(found, key=lambda one: one[:2])[2] if found else None
 
 
 @lines("sweeps")
 def sweeps() -> list[str]:
-    """Training runs per hour, where they were measured."""
+    """Every call of sweeps, where there is one: ratios are of the sweeps of a call."""
     found: list[str] = []
-    for what, same in same_jobs().items():
-        gains, sharing = same.gains(), same.gains_over_sharing()
-        steps = same.rates(STEPS)
-        rows = [
-            [
-                way,
-                str(rate.repeats),
-                shown(rate, ".1f"),
-                "1" if way == ONE_AFTER_ANOTHER else shown(gains[way]) if way in gains else "-",
-                shown(sharing[way]) if way in sharing else "-",
-                shown(steps.get(way), ",.0f"),
-            ]
-            for way, rate in sorted(same.rates().items(), key=lambda row: _order(row[0]))
-        ]
-        found += [what, "", *markdown(HEAD, rows), "", *same.calls, ""]
+    for jobs, calls in same_jobs().items():
+        rows = [_row(one, way) for one in calls for way in sorted(one.ways, key=_order)]
+        below = dict.fromkeys(one.line for one in calls)
+        found += [jobs, "", *markdown(HEAD, rows), "", *below, ""]
     return found[:-1] or [
-        f"Training runs per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."
+        f"Trainings per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."
     ]
+
+
+def _row(one: SweepsOfCall, way: str) -> list[str]:
+    cells = [one.commit, _named(way)]
+    for key, form in ((STEPS, ",.0f"), (FINISHED, ".1f")):
+        gains = (one.gain(way, base, key) for base in (ONE, PROGRAM))
+        cells += [
+            shown(one.rate(way, key), form),
+            *("" if gain is None else shown(gain) for gain in gains),
+        ]
+    return cells
+
+
+def _named(way: str) -> str:
+    at_once, backend = way.split(" at once, ")
+    if backend == "vmap":
+        return f"{at_once} in one program"
+    if at_once == "1":
+        return "one after another"
+    count = "as many as `auto` takes" if at_once == "auto" else f"{at_once} processes"
+    return count if backend == "auto" else f"{count}, `{backend}`"
 
 
 def _described(call: Call, tasks: list[str]) -> str:
@@ -146,4 +135,4 @@ def _described(call: Call, tasks: list[str]) -> str:
 
 def _order(way: str) -> tuple[str, int]:
     at_once, backend = way.split(" at once, ")
-    return backend, int(at_once) if at_once.isdigit() else 0
+    return backend, int(at_once) if at_once.isdigit() else 99

@@ -1,4 +1,4 @@
-"""Files of results say what they are from, keep every call, and are read if they are old."""
+"""Files of results say what they are from, and keep every call."""
 
 from __future__ import annotations
 
@@ -67,17 +67,12 @@ def test_only_a_call_of_the_same_code_is_gone_on_with(file: Path, monkeypatch: p
         add(file, 3, resume=True)
 
 
-def test_an_old_file_is_one_call_whose_origin_is_unknown_and_stays(file: Path):
-    summary = {"device": {"kind": "NVIDIA H200"}, "versions": {"jax": "0.11.2"}}
-    old = {"suite": "a", "cases": {"b": {"runs": [{"summary": summary}]}}}
-    file.write_text(json.dumps(old))
-    for calls in (1, 2):
-        first = read_calls(file)[0]
-        assert (first.commit, first.date, first.host) == (None, None, None)
-        assert (first.device, first.versions) == ("NVIDIA H200", {"jax": "0.11.2"})
-        assert first.results == old
-        assert len(read_calls(file)) == calls
+@pytest.mark.parametrize("found", [{"suite": "a", "cases": {}}, {"format": 3, "calls": []}])
+def test_a_file_of_another_format_is_refused_and_stays(file: Path, found: dict[str, Any]):
+    file.write_text(json.dumps(found))
+    with pytest.raises(ConfigError, match=r"format=\w+: expected 2"):
         add(file, 2)
+    assert json.loads(file.read_text()) == found
 
 
 def test_the_commit_of_a_checkout_is_found(monkeypatch: pytest.MonkeyPatch):

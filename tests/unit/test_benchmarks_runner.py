@@ -320,7 +320,7 @@ def test_only_what_has_not_succeeded_is_run_again(tmp_path: Path, monkeypatch: p
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
-        (["reward", "--only", "none"], "--only 'none': no case of these suites has that in"),
+        (["reward-ant", "--only", "none"], "--only 'none': no case of these suites has that in"),
         (["async-channels", "--gpus", "1"], "--gpus 1: every case of these suites needs more"),
     ],
 )

@@ -15,11 +15,7 @@ from benchmarks.evaluation.finding import Finding
 from benchmarks.evaluation.planned import unplanned, without_commit
 from benchmarks.evaluation.writer import SAID
 
-PLAN = """| files | call |
-|---|---|
-| `old` | 1 |
-
-## Measured too seldom
+PLAN = """## Measured too seldom
 
 | files with fewer than 3 runs | call |
 |---|---|
@@ -85,18 +81,17 @@ def test_the_front_page_refuses_few_runs_and_no_commit_even_if_planned(
     assert refused(tmp_path, "front", Evidence(3, frozenset([NEW]))) == []
 
 
-def test_other_rows_of_few_runs_or_no_commit_are_planned(tmp_path: Path):
+def test_other_rows_of_few_runs_are_planned(tmp_path: Path):
     once = Evidence(1, frozenset([NEW, OTHER]))
     (found,) = refused(tmp_path, "advice", once, "new")
     assert found.said == "is CPU, 1 run, and plan.md has no row of other"
     assert refused(tmp_path, "advice", once, "new", "other") == []
-    assert refused(tmp_path, "advice", Evidence(1, frozenset([OLD]))) == []
     assert refused(tmp_path, "advice", None) == []
 
 
 def test_a_planned_file_whose_rows_have_enough_runs_is_done(tmp_path: Path):
     (found,) = refused(tmp_path, "advice", Evidence(3, frozenset([NEW])), "new")
-    assert (found.file, found.line, found.text) == ("plan.md", 9, "new")
+    assert (found.file, found.line, found.text) == ("plan.md", 5, "new")
     assert found.said.endswith("it is done")
 
 
@@ -137,21 +132,12 @@ def test_a_page_says_no_more_runs_than_a_file_has(tmp_path: Path, text: str, is_
     assert all("runs, and new.json has" in one for one in found)
 
 
-def test_results_without_a_commit_are_planned_again(tmp_path: Path):
-    plan = tmp_path / "plan.md"
-    for name, commit in (("old", None), ("new", "abc1234")):
-        calls = [{"commit": commit, "results": {}}]
+def test_a_file_with_a_call_without_a_commit_is_refused(tmp_path: Path):
+    for name, commits in (("some", ["abc1234", None]), ("all", ["abc1234", "abc1234"])):
+        calls = [{"commit": commit, "results": {}} for commit in commits]
         (tmp_path / f"{name}.json").write_text(json.dumps({"format": 2, "calls": calls}))
-    rows = "| files | command |\n|---|---|\n| {} | `python -m other` |\n\n## Other\n| `x` | |\n"
-    plan.write_text(rows.format("`old`"))
-    assert [*without_commit(tmp_path, plan)] == []
-    plan.write_text(rows.format("`new`, `gone`"))
-    found = [*without_commit(tmp_path, plan)]
-    assert [(one.file, one.line, one.text) for one in found] == [
-        ("plan.md", 3, "new"),
-        ("old.json", 1, "old"),
-        ("plan.md", 3, "gone"),
-    ]
+    (found,) = without_commit(tmp_path)
+    assert (found.file, found.text) == ("some.json", "some")
 
 
 def test_lines_that_are_excused_are_counted(tmp_path: Path):
