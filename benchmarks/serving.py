@@ -2,9 +2,10 @@
 
 The same environments act with random actions in m GMIs (template `tcg`), and in m GMIs that
 simulate plus one that infers (`tdg`). With `--backends mps share` both run under both. With
-`--gpus` cases run at the same time, each on a GPU of its own with its part of the cores. Adds a
-call to `benchmarks/results/serving-<device>.json`; `simulator_s`, `agent_s` and `com_s` in it are
-medians of the stages of one dedicated step of all environments of a GMI.
+several `--envs` every number of GMIs runs with each. With `--gpus` cases run at the same time,
+each on a GPU of its own with its part of the cores. Adds a call to
+`benchmarks/results/serving-<device>.json`; `simulator_s`, `agent_s` and `com_s` in it are medians
+of the stages of one dedicated step of all environments of a GMI.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RunPaths, read_json
 
 Summary = Mapping[str, Any]
+ENVS = "environments of all GMIs together"
 
 
 class Setting(NamedTuple):
@@ -80,8 +82,10 @@ def settings_of(given: argparse.Namespace) -> list[Setting]:
     """The environments of a task are split over its simulators; one alone shares with nobody."""
     first, *_ = given.backends
     return [
-        Setting(task, backend, m, given.envs // m)
-        for task, backend, m in itertools.product(given.tasks, given.backends, given.simulators)
+        Setting(task, backend, m, envs // m)
+        for task, envs, backend, m in itertools.product(
+            given.tasks, given.envs, given.backends, given.simulators
+        )
         if m > 1 or backend == first or "tdg" in given.templates
     ]
 
@@ -122,7 +126,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--backends", nargs="+", default=["auto"], metavar="BACKEND")
     parser.add_argument("--templates", nargs="+", default=["tcg", "tdg"], choices=["tcg", "tdg"])
     parser.add_argument("--simulators", nargs="+", type=int, default=[1, 2, 4], metavar="M")
-    parser.add_argument("--envs", type=int, default=8192, help="environments of all GMIs together")
+    parser.add_argument("--envs", nargs="+", type=int, default=[8192], metavar="N", help=ENVS)
     parser.add_argument("--impl", default="auto", choices=["auto", "jax", "warp"])
     parser.add_argument("--unroll-length", type=int, default=32)
     parser.add_argument("--unrolls", type=int, default=20, help="unrolls of every GMI")

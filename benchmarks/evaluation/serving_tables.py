@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeAlias
 
 from benchmarks.evaluation.evidence import Evidence, Ratio, source
@@ -31,6 +31,21 @@ def _of_backends() -> Calls:
 
 def _of_templates() -> Calls:
     return _newest(lambda case: "simulator_s" in case)
+
+
+def _of_peaks() -> Calls:
+    """The newest call with several numbers of environments, in one process and in GMIs."""
+    calls = calls_by_date("serving-*nvidia-*.json")
+    found = [one for one in calls if any(_sides(one[0].results["cases"], task) for task in TASKS)]
+    return {"newest": found[-1]} if found else {}
+
+
+def _sides(cases: Sequence[Case], task: str) -> list[list[Case]]:
+    """Cases of a task in one process and in GMIs; nothing if they have one size."""
+    mine = [case for case in cases if case.get("task") == task and "colocated" in case]
+    sides = [[case for case in mine if (case["simulators"] > 1) == gmis] for gmis in (False, True)]
+    sizes = {case["simulators"] * case["num_envs"] for case in mine}
+    return sides if all(sides) and len(sizes) > 1 else []
 
 
 def _cases(calls: Calls) -> list[Case]:
@@ -65,6 +80,37 @@ def mps_gains() -> dict[str, Ratio | None]:
 def mps_over_one(task: str, gmis: int) -> Ratio | None:
     """Steps/s of GMIs under MPS over one process, of one call."""
     return over(serving_rate(task, gmis), serving_rate(task, 1))
+
+
+def _peaks(task: str) -> list[tuple[str, Figure]]:
+    """The fastest size of one process and of GMIs under MPS, and their steps/s."""
+    calls = _of_peaks()
+    sources = [source(path.stem, call) for call, path in calls.values()]
+    best = [max(side, key=lambda case: case["colocated"]) for side in _sides(_cases(calls), task)]
+    return [
+        (f"{case['simulators']} x {case['num_envs']:,}", found)
+        for case in best
+        if (found := figure([r["step_per_s_inference"] for r in case["runs"]["tcg"]], *sources))
+    ]
+
+
+def peak_over_peak(task: str) -> Ratio | None:
+    """Steps/s of serving in GMIs over one process, each with its best number of environments."""
+    (_, one), (_, several) = _peaks(task) or [("", None)] * 2
+    return over(several, one)
+
+
+@table_of_calls(
+    "serving-peaks",
+    "task | one process x environments | steps/s: | several GMIs | steps/s: | ratio:",
+    _of_peaks,
+)
+def serving_peaks(_: Calls) -> Rows:
+    """Each side at its own best number of environments, as the paper's figure 7a."""
+    for task in TASKS:
+        if peaks := _peaks(task):
+            cells = [cell for size, rate in peaks for cell in (size, shown(rate, ",.0f"))]
+            yield [f"`{task}`", *cells, shown(peak_over_peak(task))]
 
 
 def templates_gains() -> list[Ratio]:
