@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from benchmarks.evaluation.evidence import Evidence, Ratio, source
 from benchmarks.evaluation.figures import Figure, figure, over, shown
 from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
 from benchmarks.paper_model import Task, serving_gain
-from benchmarks.records import calls_by_date
+from benchmarks.records import Call, calls_by_date
 
 Case: TypeAlias = Mapping[str, Any]
 
@@ -18,53 +19,54 @@ GMIS = (2, 3, 4, 8)
 """That share 8192 environments."""
 
 
-def _newest(is_wanted: Callable[[Case], bool]) -> Calls:
-    """The newest call with such a case."""
+def _newest(is_wanted: Callable[[Sequence[Case]], object]) -> Calls:
+    """By task, the newest call whose cases of it are wanted."""
     calls = calls_by_date("serving-*nvidia-*.json")
-    found = [one for one in calls if any(map(is_wanted, one[0].results["cases"]))]
-    return {"newest": found[-1]} if found else {}
+    return {task: one for one in calls for task in TASKS if is_wanted([*_cases({task: one})])}
+
+
+def _cases(calls: Calls) -> Iterator[Case]:
+    """That succeeded, of the task of each call."""
+    for task, (call, _) in sorted(calls.items()):
+        yield from (case for case in call.results["cases"] if case.get("task") == task)
 
 
 def _of_backends() -> Calls:
-    return _newest(lambda case: case["backend"] == "share" and "colocated" in case)
+    return _newest(lambda cases: [one for one in cases if one["backend"] == "share"])
 
 
 def _of_templates() -> Calls:
-    return _newest(lambda case: "simulator_s" in case)
+    return _newest(lambda cases: [one for one in cases if "simulator_s" in one])
 
 
 def _of_peaks() -> Calls:
-    """The newest call with several numbers of environments, in one process and in GMIs."""
-    calls = calls_by_date("serving-*nvidia-*.json")
-    found = [one for one in calls if any(_sides(one[0].results["cases"], task) for task in TASKS)]
-    return {"newest": found[-1]} if found else {}
+    """With several numbers of environments, in one process and in GMIs."""
+    return _newest(_sides)
 
 
-def _sides(cases: Sequence[Case], task: str) -> list[list[Case]]:
+def _sides(cases: Sequence[Case]) -> list[list[Case]]:
     """Cases of a task in one process and in GMIs; nothing if they have one size."""
-    mine = [case for case in cases if case.get("task") == task and "colocated" in case]
+    mine = [case for case in cases if "colocated" in case]
     sides = [[case for case in mine if (case["simulators"] > 1) == gmis] for gmis in (False, True)]
     sizes = {case["simulators"] * case["num_envs"] for case in mine}
     return sides if all(sides) and len(sizes) > 1 else []
 
 
-def _cases(calls: Calls) -> list[Case]:
-    return [case for call, _ in calls.values() for case in call.results["cases"]]
-
-
 def _case(task: str, gmis: int, backend: str) -> Case | None:
-    """Of an old call that has several of this name, the last."""
     name = f"{task} {gmis} x {8192 // gmis}, {backend}"
-    found = [case for case in _cases(_of_backends()) if case["name"] == name]
-    return found[-1] if found and "colocated" in found[-1] else None
+    return next((case for case in _cases(_of_backends()) if case["name"] == name), None)
 
 
 def serving_rate(task: str, gmis: int, backend: str = "mps") -> Figure | None:
     """Steps/s of serving in GMIs that share 8192 environments."""
     case = _case(task, gmis, backend)
-    runs = case["runs"]["tcg"] if case else ()
-    sources = [source(path.stem, call) for call, path in _of_backends().values()]
-    return figure([run["step_per_s_inference"] for run in runs], *sources)
+    return _rate(case, _of_backends()[task]) if case else None
+
+
+def _rate(case: Case, made_by: tuple[Call, Path]) -> Figure | None:
+    call, path = made_by
+    rates = [run["step_per_s_inference"] for run in case["runs"]["tcg"]]
+    return figure(rates, source(path.stem, call))
 
 
 def mps_over_share(task: str, gmis: int) -> Ratio | None:
@@ -84,13 +86,14 @@ def mps_over_one(task: str, gmis: int) -> Ratio | None:
 
 def _peaks(task: str) -> list[tuple[str, Figure]]:
     """The fastest size of one process and of GMIs under MPS, and their steps/s."""
-    calls = _of_peaks()
-    sources = [source(path.stem, call) for call, path in calls.values()]
-    best = [max(side, key=lambda case: case["colocated"]) for side in _sides(_cases(calls), task)]
+    if (made_by := _of_peaks().get(task)) is None:
+        return []
+    sides = _sides([*_cases({task: made_by})])
+    best = [max(side, key=lambda case: case["colocated"]) for side in sides]
     return [
         (f"{case['simulators']} x {case['num_envs']:,}", found)
         for case in best
-        if (found := figure([r["step_per_s_inference"] for r in case["runs"]["tcg"]], *sources))
+        if (found := _rate(case, made_by))
     ]
 
 
@@ -131,9 +134,10 @@ def of_communication() -> list[Ratio]:
 
 def _of_both_templates() -> Iterator[tuple[Case, Evidence]]:
     calls = _of_templates()
-    sources = frozenset(source(path.stem, call) for call, path in calls.values())
     for case in _cases(calls):
         if "simulator_s" in case:
+            call, path = calls[case["task"]]
+            sources = frozenset([source(path.stem, call)])
             yield case, Evidence(min(map(len, case["runs"].values())), sources)
 
 

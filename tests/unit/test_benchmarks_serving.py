@@ -14,9 +14,9 @@ from benchmarks.evaluation.writer import TABLES
 from benchmarks.serving import settings_of
 
 
-def case(simulators: int, num_envs: int, *rates: float) -> dict[str, Any]:
+def case(simulators: int, num_envs: int, *rates: float, task: str = "ant") -> dict[str, Any]:
     runs = {"tcg": [{"step_per_s_inference": rate} for rate in rates], "tdg": []}
-    size = {"task": "ant", "backend": "mps", "simulators": simulators, "num_envs": num_envs}
+    size = {"task": task, "backend": "mps", "simulators": simulators, "num_envs": num_envs}
     median = sorted(rates)[len(rates) // 2]
     return {"name": f"{simulators} x {num_envs}", **size, "runs": runs, "colocated": median}
 
@@ -56,6 +56,15 @@ def test_each_side_is_taken_at_its_own_best_number_of_environments(results: Path
     table = "\n".join(TABLES["serving-peaks"]())
     assert "| `ant` | 1 x 256 | 40 (39 to 41, n=3) | 2 x 32 | 30 (20 to 40, n=3) | 0.75 |" in table
     assert peak_over_peak("humanoid") is None
+
+
+def test_a_later_call_of_another_task_hides_nothing(results: Path):
+    write(
+        results,
+        [case(1, 64, 10), case(1, 128, 20), case(2, 32, 30)],
+        [case(n, size, 10 * n, task="humanoid") for n in (1, 2) for size in (32, 64)],
+    )
+    assert (peak_over_peak("ant"), peak_over_peak("humanoid")) == (1.5, 2.0)
 
 
 def test_one_size_is_no_peak(results: Path):
