@@ -13,6 +13,7 @@ from gmijax.config.removed import REMOVED, without_removed
 from gmijax.config.schema import flatten, from_dict, from_named, known, to_dict
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.names import nearby
 from gmijax.runs.resume import any_checkpoint
 
 _OWN_KEYS: Final = ("run.dir", "run.name", "run.resume", "run.profile", "env.source_sha256")
@@ -37,7 +38,7 @@ def saved_config(checkpoint: Path) -> dict[str, Any]:
     run = RunPaths(checkpoint.parent.parent)
     if not os.path.lexists(run.config):
         raise ConfigError(
-            f"checkpoint {checkpoint}: no config.json in {run.root}; "
+            f"checkpoint {nearby(checkpoint)}: no config.json in {nearby(run.root)}; "
             "a checkpoint can only be used in its run folder"
         )
     return config_of_run(run)
@@ -54,7 +55,7 @@ def config_of_run(run: RunPaths) -> dict[str, Any]:
     """
     saved = without_removed(read_json(run.config))
     if not all(isinstance(saved.get(group), dict) for group in ("env", "algo", "run")):
-        raise ConfigError(f"{run.config}: not the configuration of a training run")
+        raise ConfigError(f"{nearby(run.config)}: not the configuration of a training run")
     if saved["env"].get("suite") == "custom":
         # A file of which nothing is noted is none that can be recognised.
         saved["env"]["source_sha256"] = saved["env"].get("source_sha256") or ""
