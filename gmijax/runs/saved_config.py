@@ -62,13 +62,46 @@ def config_of_run(run: RunPaths) -> dict[str, Any]:
     return saved
 
 
+def require_own_values(
+    config: Mapping[str, Any], run: RunPaths, command: Mapping[str, Any], saved: Mapping[str, Any]
+) -> None:
+    """Blames the file of a run for a wrong value that a training which goes on takes from it.
+
+    Args:
+      config: of the training, as plain data.
+      run: whose file it is.
+      command: the same without what the run has saved.
+      saved: the same without what the command line says otherwise.
+
+    Raises:
+      ConfigError: names the file; what the command line says wrongly is found later.
+    """
+    wrong = _why_wrong(config)
+    if wrong is not None and wrong == _why_wrong(saved) and wrong != _why_wrong(command):
+        raise ConfigError(f"{nearby(run.config)}: {wrong}")
+
+
+def _why_wrong(config: Mapping[str, Any]) -> str | None:
+    try:
+        from_dict(TrainConfig, config)
+    except ConfigError as error:
+        return str(error)
+    return None
+
+
 def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
     """Task and algorithm of the run that a checkpoint lies in.
 
     Raises:
-      ConfigError: the checkpoint does not lie in the folder of a training run.
+      ConfigError: the checkpoint does not lie in the folder of a training run, or its file has a
+        wrong value of them.
     """
-    return task_and_algorithm(saved_config(checkpoint))
+    saved = saved_config(checkpoint)
+    try:
+        return task_and_algorithm(saved)
+    except ConfigError as error:
+        file = nearby(RunPaths(checkpoint.parents[1]).config)
+        raise ConfigError(f"{file}: {error}") from None
 
 
 def task_and_algorithm(saved: Mapping[str, Any]) -> tuple[EnvConfig, AlgoConfig]:
