@@ -97,7 +97,7 @@ def _run(
     job_events = JobEvents(events, work.name, jobs, paths)
     try:
         with errors_of_files(paths):
-            _run_jobs(work, hosts, paths, console, study, report, view, jobs, job_events)
+            said = _run_jobs(work, hosts, paths, console, study, report, view, jobs, job_events)
     except BaseException as error:
         status = "interrupted" if isinstance(error, JobInterrupted) else "failed"
         if (wrong := report.end(status)) is not None:
@@ -108,7 +108,8 @@ def _run(
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
     job_events.end(report.data)
-    print_outcome(console, report.data, work.ranking, paths, view.line(), work.hint(report.data))
+    hint = "" if said else work.hint(report.data)
+    print_outcome(console, report.data, work.ranking, paths, view.line(), hint)
     _require_success(failed, len(jobs), wrong, paths)
     if ranking := report.data["ranking"]:
         print_next(console, work.next_step(paths, ranking[0]))
@@ -153,8 +154,8 @@ def _run_jobs(
     view: SweepView,
     jobs: list[J],
     job_events: JobEvents,
-) -> None:
-    """Runs the jobs; returns when all have ended."""
+) -> str:
+    """Runs the jobs; returns when all have ended, with the hint that was printed meanwhile."""
     with stop_signals() as signals, ExitStack() as held:
         _lease(work, hosts, work.sites(hosts), console, signals)
         work = work.decided(hosts, console, signals, paths.root if hosts[0].name else None)
@@ -173,7 +174,7 @@ def _run_jobs(
         def tick() -> None:
             report.update()
             if not hinted and (hint := work.hint(report.data)):
-                hinted.append(hint)  # At the end it is said once more.
+                hinted.append(hint)
                 console.print(hint)
             view.update(signals.name)
             job_events.update()
@@ -191,6 +192,7 @@ def _run_jobs(
         ).run(signals)
     if not jobs:
         raise ConfigError(f"{work.name}: no trial had values that are allowed together")
+    return "".join(hinted)
 
 
 @contextmanager
