@@ -119,7 +119,11 @@ def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
 
     To train on without them would be another training. Policies act without, see `trained_config`.
     """
-    if unknown := _unknown_keys(saved):
+    try:
+        unknown = _unknown_keys(saved)
+    except ConfigError as error:
+        raise ConfigError(f"{what}: its config.json: {error}") from None
+    if unknown:
         write = [f"{key}: {REMOVED[key].write}" for key in flatten(saved) if key in REMOVED]
         raise ConfigError(
             f"{what}: its config.json has keys that this version does not know: {unknown}; take "

@@ -259,6 +259,16 @@ def test_a_wrong_value_that_a_run_has_saved_is_not_blamed_on_the_command(
     assert str(error.value).startswith(f"run/config.json: {said}")
 
 
+def test_an_algorithm_without_a_name_is_blamed_on_the_file(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(run.root.parent)
+    edited(run, "algo", {"name": "sca"})
+    said = r"^run\.resume=run: its config\.json: algo\.name=sca: expected one of ppo, "
+    with pytest.raises(ConfigError, match=said):
+        compose("run.resume=run")
+
+
 def test_a_wrong_value_of_the_command_is_not_blamed_on_the_file(run: RunPaths):
     said = r"^num_envs=x: expected an integer or auto$"
     with pytest.raises(ConfigError, match=said):
