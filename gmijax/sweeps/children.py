@@ -16,7 +16,6 @@ from gmijax.errors import GmijaxError, JobNotStarted
 from gmijax.machine.processes import GuardPipe, ProcessId, members_of
 from gmijax.runs.folder import write_json
 from gmijax.runs.held import try_lock
-from gmijax.runs.names import as_typed, nearby
 from gmijax.supervise.failures import last_line
 
 INTERRUPT_BYTE: Final = b"i"
@@ -179,7 +178,7 @@ def errors_of_one_job(cwd: str | None = None) -> Iterator[None]:
         if error.errno in _OF_ALL_JOBS:
             raise
         what = "working folder " if cwd is not None and error.filename == cwd else ""
-        where = f"{what}{as_typed(error.filename)}: " if error.filename else ""
+        where = f"{what}{error.filename}: " if error.filename else ""
         raise JobNotStarted(f"cannot be started ({where}{error.strerror})") from None
 
 
@@ -218,5 +217,5 @@ def _locked(path: Path) -> int:
     """
     fd = try_lock(path)
     if fd is None:
-        raise JobNotStarted(f"a process of an earlier command still runs ({nearby(path)})")
+        raise JobNotStarted(f"a process of an earlier command still runs ({path})")
     return fd

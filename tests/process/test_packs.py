@@ -229,18 +229,18 @@ def test_a_command_that_cannot_be_started_does_not_end_the_others(tmp_path: Path
     words = ("pack.commands=cmds.txt", "pack.jobs_per_gpu=2", "run.dir=all")
     done = train(*words, cwd=tmp_path, command="pack")
     assert done.returncode == 1
-    assert "2 of 5 jobs failed; job 1: cannot be started (./alien: Exec" in done.stderr
+    assert f"2 of 5 jobs failed; job 1: cannot be started ({tmp_path}/alien: Exec" in done.stderr
     found = report(tmp_path / "all")["jobs"]
     states = [job["state"] for job in found]
     assert states == ["completed", "failed", "completed", "failed", "completed"]
-    assert found[3]["error"] == "cannot be started (./late: Permission denied)"
+    assert found[3]["error"] == f"cannot be started ({tmp_path}/late: Permission denied)"
 
 
 def test_a_missing_working_folder_is_named(tmp_path: Path) -> None:
     words = ("pack.copies=2", "pack.cwd={run_dir}/sub", "run.dir=all")
     done = train(*words, "--", "true", cwd=tmp_path, command="pack")
     assert done.returncode == 1
-    assert "working folder all/000/sub: No such file" in done.stderr
+    assert f"working folder {tmp_path}/all/000/sub: No such file" in done.stderr
     assert [job["state"] for job in report(tmp_path / "all")["jobs"]] == ["failed"] * 2
 
 
