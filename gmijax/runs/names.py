@@ -72,7 +72,7 @@ def nearby(path: Path) -> str:
 
 
 def as_typed(program: str) -> str:
-    """A program, or another file of a command, as it is typed from the working directory.
+    """A program as it is typed from the working directory.
 
     With `./` where it would be one of PATH without.
     """
