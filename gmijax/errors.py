@@ -73,6 +73,18 @@ class NoCheckpointYet(ConfigError):
         self.run = run
 
 
+class DamagedFile(ConfigError):
+    """A file of a run cannot be read, or is not what its name says.
+
+    Attributes:
+      cause: why, without the file.
+    """
+
+    def __init__(self, what: str, cause: str) -> None:
+        super().__init__(f"{what} ({cause})")
+        self.cause = cause
+
+
 class BackendUnavailable(ConfigError):
     """The wanted backend cannot be had on this machine; the message says what is missing."""
 

@@ -21,9 +21,10 @@ from typing import Any
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.config.schema import require_positive
-from gmijax.errors import ConfigError, GmijaxError
+from gmijax.errors import ConfigError, DamagedFile, GmijaxError
 from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import read_json, write_json
+from gmijax.runs.names import nearby
 
 _DIGEST_LENGTH = 10
 
@@ -104,7 +105,7 @@ class ProfileStore:
                 write_json(self.path, {"key": self._key, "profiles": self._records})
         except OSError as error:
             raise GmijaxError(
-                f"search.store={self.path.parent}: cannot be written ({error.strerror})"
+                f"search.store={nearby(self.path.parent)}: cannot be written ({error.strerror})"
             ) from None
 
     def _load(self) -> dict[str, dict[str, Any]]:
@@ -117,8 +118,10 @@ class ProfileStore:
             return dict(profiles)
         except (ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
             aside = _moved_aside(self.path)
-            what = " ".join(str(error).split()) or type(error).__name__
-            self._note(f"profile store {self.path} is broken ({what}): moved to {aside}")
+            why = error.cause if isinstance(error, DamagedFile) else str(error)
+            what = " ".join(why.split()) or type(error).__name__
+            where = nearby(self.path)
+            self._note(f"profile store {where} is broken ({what}): moved to {nearby(aside)}")
             return {}
 
 
@@ -138,7 +141,7 @@ def _moved_aside(path: Path) -> Path:
         os.replace(path, aside)
     except OSError as error:
         raise ConfigError(
-            f"search.store={path.parent}: cannot move {path.name} ({error.strerror})"
+            f"search.store={nearby(path.parent)}: cannot move {path.name} ({error.strerror})"
         ) from None
     return aside
 

@@ -222,7 +222,7 @@ class Search:
                 raise OutOfBudget from None
             return NotRunnable(str(late), limit_s)
         except JobInterrupted as error:
-            error.add_note(f"the same search continues from {self._store.path}")
+            error.add_note(f"the same search continues from {nearby(self._store.path)}")
             raise
 
     def _require_best(self, outcome: SearchOutcome) -> SearchPoint:

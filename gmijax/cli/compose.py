@@ -28,7 +28,15 @@ from gmijax.config.env import choice_of
 from gmijax.config.removed import require_not_removed
 from gmijax.config.schema import flatten, from_dict, known, require_between, suggestion
 from gmijax.errors import ConfigError
-from gmijax.runs.saved_config import require_known_keys, saved_config_of
+from gmijax.runs.folder import RunPaths
+from gmijax.runs.resume import any_checkpoint
+from gmijax.runs.saved_config import (
+    require_known_keys,
+    require_own_values,
+    saved_config,
+    saved_config_of,
+    trained_config,
+)
 from gmijax.sim.registry import SUITES
 from gmijax.sim.robots import robot_name
 from gmijax.sim.source import reference
@@ -282,9 +290,10 @@ def _on_top_of_saved(
 
     What an older version did not save comes from the defaults for the run's own task.
     """
-    saved = saved_config_of(resume, "run.resume")
+    checkpoint = any_checkpoint(resume, "run.resume")
+    run, saved = RunPaths(checkpoint.parents[1]), saved_config(checkpoint)
     require_known_keys(saved, f"run.resume={resume}")
-    saved["run"].update(dir=None, name=None, profile=None)
+    saved["run"].update(dir=None, name=None, profile=None, resume=resume)
     suite = saved["env"].get("suite", "gmijax")
     merged = with_saved(data, saved)
     for item in items:
@@ -301,7 +310,7 @@ def _on_top_of_saved(
                 "change single keys with key=value"
             )
         raise _unknown_key(key, flatten(data))
-    merged["run"]["resume"] = resume
+    require_own_values(merged, run, data, with_saved(data, saved))
     return merged
 
 
@@ -310,7 +319,9 @@ def _with_task_of_run(data: dict[str, Any], items: Sequence[Override]) -> dict[s
     run_dir = data["run"].get("dir") if isinstance(data["run"], dict) else None
     if run_dir is None or any(item.key_or_group == "env" for item in items):
         return data
-    saved, _ = known([EnvConfig], saved_config_of(str(run_dir), "run.dir")["env"])
+    checkpoint = any_checkpoint(str(run_dir), "run.dir")
+    trained_config(checkpoint)  # What is wrong in its file is not the command's mistake.
+    saved, _ = known([EnvConfig], saved_config(checkpoint)["env"])
     # A policy that has learnt needs no easy episodes, unless they are asked for.
     saved["curriculum"] = data["env"]["curriculum"]
     merged = {**data, "env": {**data["env"], **saved}}

@@ -11,7 +11,7 @@ from hydra.core.override_parser.types import Override
 
 from gmijax.config.schema import convert, flatten
 from gmijax.runs.folder import RunPaths, given_run
-from gmijax.runs.saved_config import config_of_run, require_known_keys
+from gmijax.runs.saved_config import config_of_run, require_known_keys, require_own_values
 
 NAMED_BY_TASK: Final = ("env.rewards.", "env.settings.")
 """Groups of keys whose names, which may have dots, are the task's; those of tasks of others only
@@ -67,6 +67,7 @@ def as_the_run_was(
     named = [item.key_or_group for item in items if item.key_or_group not in ("env", "algo")]
     for key in (*_OF_THE_COMMAND, *changed, *named):
         copy_key(key, data, merged)
+    require_own_values(merged, paths, data, with_saved(data, saved))
     return merged
 
 

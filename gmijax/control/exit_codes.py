@@ -8,10 +8,12 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Final
 
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.runs.names import nearby
 from gmijax.supervise.stop_signals import STOP_SIGNALS
 
 EXIT_OK: Final = 0
@@ -22,7 +24,7 @@ EXIT_INTERRUPTED: Final = 130
 _OF_DISKS: Final = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 """Errors of a file that no command can help."""
 
-_OF_KINDS: Final = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST)
+OF_KINDS: Final = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST)
 """A folder stands where a command writes a file, or a file where it makes a folder."""
 
 
@@ -42,10 +44,11 @@ def exit_code_of(name: str, run: Callable[[], object]) -> int:
         _complain(name, error)
         return EXIT_FAILED
     except OSError as error:
-        if error.errno not in (*_OF_DISKS, *_OF_KINDS):
+        if error.errno not in (*_OF_DISKS, *OF_KINDS):
             raise  # It may be a fault of gmijax.
-        _complain(name, f"{error.filename2 or error.filename or 'a file'}: {error.strerror}")
-        return EXIT_BAD_INPUT if error.errno in _OF_KINDS else EXIT_FAILED
+        where = error.filename2 or error.filename
+        _complain(name, f"{nearby(Path(where)) if where else 'a file'}: {error.strerror}")
+        return EXIT_BAD_INPUT if error.errno in OF_KINDS else EXIT_FAILED
 
 
 @contextmanager

@@ -261,11 +261,11 @@ def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
         drop_half_written(run)  # The controller may have been killed at the very end.
     summary = summary_of(run)
     if summary.get("status") != "completed":
+        data = read_json(run.plan)
         try:
-            plan = Plan.from_dict(read_json(run.plan))
+            plan = Plan.from_dict(data)
         except ConfigError as error:
-            why = str(error).removeprefix(f"{run.plan}: ")
-            raise ConfigError(f"{nearby(run.plan)}: {why}") from None
+            raise ConfigError(f"{nearby(run.plan)}: {error}") from None
         summary = train_summary(config, plan, run, "completed", 0.0, [])
         write_json(run.summary, summary)
     console.print(f"this run is complete already: {nearby(run.root)}")

@@ -57,7 +57,7 @@ def opened(config: TrainConfig, start_point: StartPoint) -> Iterator[HeldRun]:
     run = start_point.open(config)
 
     with (
-        locked(run.lock, f"run.dir={run.root}") as folder,
+        locked(run.lock, f"run.dir={nearby(run.root)}") as folder,
         gone_if_unused(run.root, partial(is_needless, config, run)),
     ):
         record_git(run, Path.cwd())

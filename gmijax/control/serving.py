@@ -111,20 +111,21 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
         if (data := job.data) is not None:
             is_new = not data.dataset.exists()
             open_dataset(data, _about(job))
-            folders.append(held.enter_context(locked(data.lock, f"output.dir={data.root}")))
+            shown = f"output.dir={nearby(data.root)}"
+            folders.append(held.enter_context(locked(data.lock, shown)))
             if is_new:
                 no_shard = partial(_has_no_shard, data)
                 held.enter_context(gone_if_unused(data.root, no_shard))
         kept = job.finished_unrolls()
-        if kept and kept == job.wanted_unrolls:
+        if data is not None and kept and kept == job.wanted_unrolls:
             raise ConfigError(
-                f"num_timesteps={job.config.num_timesteps}: output.dir={job.config.output.dir} "
+                f"num_timesteps={job.config.num_timesteps}: output.dir={nearby(data.root)} "
                 f"has {kept * job.steps_per_unroll} steps already; set num_timesteps above that"
             )
         env = job.config.env
         run = create_run(None, job.config.run.name, f"{env.slug}-serve")
         held.enter_context(gone_if_unused(run.root, partial(_has_collected_nothing, job, run)))
-        folders.append(held.enter_context(OpenFolder(run.root, f"run.dir={run.root}")))
+        folders.append(held.enter_context(OpenFolder(run.root, f"run.dir={nearby(run.root)}")))
         write_json(run.config, to_dict(job.config))
         write_json(run.plan, job.plan.to_dict())
         _announce(console, job, kept, run)
@@ -320,9 +321,10 @@ def _output(job: _ServingJob, kept: int) -> dict[str, Any] | None:
 def _what_is_left(job: _ServingJob) -> str:
     if job.data is None:
         return _NOTHING_WRITTEN
-    done = job.finished_unrolls()
+    if not (done := job.finished_unrolls()):
+        return "no shard was finished; the same command begins again"
     return (
-        f"{done} of {job.wanted_unrolls} shards are in {job.data.root}; "
+        f"{done} of {job.wanted_unrolls} shards are in {nearby(job.data.root)}; "
         "the same command makes the rest"
     )
 

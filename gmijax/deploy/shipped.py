@@ -15,6 +15,7 @@ from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.opengl import NO_OPENGL, environment_with
 from gmijax.player.shipped import require_alone, require_shipped
 from gmijax.runs.folder import RUNS, PlayPaths, RunPaths, remove_temporary, write_json
+from gmijax.runs.names import nearby
 from gmijax.supervise.failures import last_line
 
 SHIPPED: Final = "shipped"
@@ -50,7 +51,7 @@ def folder_of(config: PlayConfig) -> PlayPaths:
         for path in paths.results():
             path.unlink(missing_ok=True)
     except OSError as error:
-        raise ConfigError(f"cannot write to {paths.root} ({error.strerror})") from None
+        raise ConfigError(f"cannot write to {nearby(paths.root)} ({error.strerror})") from None
     return PlayPaths(Path(paths.root).resolve())
 
 

@@ -14,7 +14,7 @@ from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError
 from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of
 from gmijax.runs.folder import META, RunPaths, remove_temporary, write_json
-from gmijax.runs.names import steps_name
+from gmijax.runs.names import nearby, steps_name
 from gmijax.runs.ranking import best_checkpoint, ranked
 from gmijax.runs.resume import find_checkpoint, first_checkpoint_of, newer_than, unsaved_runs
 from gmijax.runs.saved_config import left_out, trained_config
@@ -100,7 +100,7 @@ def _at_step(run: Path, env_steps: int) -> Path:
     if not (checkpoint / META).is_file():
         steps = ", ".join(str(int(path.name)) for path in checkpoints_of(run))
         raise ConfigError(
-            f"checkpoint={env_steps}: no such checkpoint in {run}; there are {steps}"
+            f"checkpoint={env_steps}: no such checkpoint in {nearby(run)}; there are {steps}"
         )
     return checkpoint
 
@@ -130,5 +130,5 @@ def output_folder(
         for path in stale(root):
             path.unlink(missing_ok=True)
     except OSError as error:
-        raise ConfigError(f"run.dir={run}: cannot write to {root} ({error.strerror})") from None
+        raise ConfigError(f"cannot write to {nearby(root)} ({error.strerror})") from None
     return root

@@ -30,6 +30,7 @@ from gmijax.learning.episode_window import Standing
 from gmijax.learning.kept_checkpoints import keep_best, keep_last_replays, remove
 from gmijax.runs.checkpoints import CheckpointMeta, file_check
 from gmijax.runs.folder import META, RunPaths, read_json, replay_name, replays_of, write_json
+from gmijax.runs.names import nearby
 from gmijax.types import PyTree
 
 T = TypeVar("T")
@@ -113,7 +114,7 @@ def require_disk_for(run: RunPaths, replay: PyTree | None, num_gmis: int) -> Non
     if need and need > (free := shutil.disk_usage(run.root).free / 2**20):
         raise ConfigError(
             f"algo.save_replay=true: the replays take {need:,.0f} MiB at the end, and the disk of "
-            f"{run.root} has {free:,.0f} MiB left; lower algo.replay_steps, or set "
+            f"{nearby(run.root)} has {free:,.0f} MiB left; lower algo.replay_steps, or set "
             "algo.save_replay=false"
         )
 
@@ -208,7 +209,7 @@ def learner_sizes(checkpoint: Path) -> tuple[int, int, int]:
         (action_size,) = shapes["params.log_std"]
         actor_obs_size, _ = shapes["params.policy.params.Dense_0.kernel"]
     except (KeyError, ValueError) as error:
-        raise ConfigError(f"checkpoint {folder}: holds no policy") from error
+        raise ConfigError(f"checkpoint {nearby(folder)}: holds no policy") from error
     return obs_size, actor_obs_size, action_size
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from gmijax.errors import ConfigError, GmijaxError, lines_of
+from gmijax.runs.names import nearby
 from gmijax.types import PyTree
 
 T = TypeVar("T")
@@ -33,7 +34,9 @@ def save(folder: Path, tree: PyTree) -> None:
     with _plain_path(folder) as path, ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(path, plain)
     if _difference(saved_shapes(folder), _shapes(plain)) is not None:
-        raise GmijaxError(f"checkpoint {folder}: cannot be read again after it was written")
+        raise GmijaxError(
+            f"checkpoint {nearby(folder)}: cannot be read again after it was written"
+        )
 
 
 def restore(folder: Path, template: T) -> T:
@@ -53,14 +56,14 @@ def restore(folder: Path, template: T) -> T:
         if not isinstance(error, ValueError | KeyError | OSError) and type(error) is not Exception:
             raise
         why = lines_of(error)[0]
-        raise ConfigError(f"checkpoint {folder} does not fit this job: {why}") from error
+        raise ConfigError(f"checkpoint {nearby(folder)} does not fit this job: {why}") from error
     wanted = _shapes(jax.eval_shape(_storable, template))
     for name in wanted.keys() - saved.keys():
         kept = _KEPT + name.removeprefix(_LEARNING)
         if name.startswith(_LEARNING) and kept in saved:
             saved[name] = saved[kept]
     if why := _difference(_shapes(saved), wanted):
-        raise ConfigError(f"checkpoint {folder} does not fit this job: {why}")
+        raise ConfigError(f"checkpoint {nearby(folder)} does not fit this job: {why}")
     return jax.tree.map_with_path(lambda path, like: _restored(like, saved[_name(path)]), template)
 
 

@@ -14,6 +14,7 @@ from gmijax.config.pack import PackConfig
 from gmijax.errors import ConfigError
 from gmijax.packs.template import fill, require_names
 from gmijax.runs.folder import why_no_folder
+from gmijax.runs.names import as_typed
 from gmijax.sweeps.any_job import label_of
 from gmijax.sweeps.paths import DIGITS
 from gmijax.sweeps.progress import Progress
@@ -29,6 +30,7 @@ class CommandJob:
       command: arguments, with placeholders.
       total_steps: steps at its end (`pack.total_steps`); None: its output may have them.
       progress: how far it is.
+      line: its number in the file of commands; None: it is from no file.
     """
 
     number: int
@@ -36,6 +38,7 @@ class CommandJob:
     command: tuple[str, ...]
     total_steps: int | None = None
     progress: Progress = field(default_factory=Progress)
+    line: int | None = None
 
     num_gpus = 1
 
@@ -94,7 +97,8 @@ def jobs_of_file(settings: PackConfig) -> tuple[CommandJob, ...]:
         if words:
             name = {"command": shlex.join(words)}
             words[0] = absolute(words[0])
-            jobs.append(CommandJob(len(jobs), name, tuple(words), settings.total_steps))
+            job = CommandJob(len(jobs), name, tuple(words), settings.total_steps, line=number)
+            jobs.append(job)
     if not jobs:
         raise ConfigError(f"pack.commands={path}: holds no command")
     return tuple(jobs)
@@ -119,11 +123,18 @@ def require_programs(jobs: Sequence[CommandJob], settings: PackConfig) -> None:
       ConfigError: names it.
     """
     path = settings.env.get("PATH")
-    for name in dict.fromkeys(job.arguments(Path("{run_dir}"))[0] for job in jobs):
-        if "{run_dir}" in name:
+    seen: set[str] = set()
+    for job in jobs:
+        name = job.arguments(Path("{run_dir}"))[0]
+        if name in seen or "{run_dir}" in name:
             continue
+        seen.add(name)
         if shutil.which(name, path=None if path is None else str(path)) is None:
-            raise ConfigError(f"{name}: no such program, or it cannot be executed")
+            file = f"pack.commands={settings.commands}: line {job.line}: "
+            raise ConfigError(
+                f"{'' if job.line is None else file}{as_typed(name)}: no such program, or it "
+                "cannot be executed"
+            )
     if settings.cwd is None:
         return
     for folder in dict.fromkeys(job.folder(Path("{run_dir}"), settings.cwd) for job in jobs):

@@ -176,8 +176,7 @@ class PackWork(Work[CommandJob]):
         try:
             status = read_json(run.summary).get("status")
         except ConfigError as error:  # The program may not be one that may run twice.
-            why = str(error).replace(str(run.summary), nearby(run.summary))
-            raise ConfigError(f"{why}; remove it to run job {job.number} again") from None
+            raise ConfigError(f"{error}; remove it to run job {job.number} again") from None
         return "completed" if status == "completed" else "waiting"
 
     def described(self) -> dict[str, Any]:

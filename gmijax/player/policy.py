@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import POLICY, open_regular, write_bytes
+from gmijax.runs.names import nearby
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 
@@ -128,9 +129,10 @@ def read_policy(path: Path) -> PlainPolicy:
         with open_regular(path) as file, np.load(file, allow_pickle=False) as data:
             return _policy_of(data)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise ConfigError(f"{nearby(path)}: cannot be read ({error.strerror or error})") from None
     except (EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{path}: not a policy ({' '.join(str(error).split())})") from None
+        why = " ".join(str(error).split())
+        raise ConfigError(f"{nearby(path)}: not a policy ({why})") from None
 
 
 def checkpoint_policy(checkpoint: Path) -> PlainPolicy:
@@ -142,8 +144,8 @@ def checkpoint_policy(checkpoint: Path) -> PlainPolicy:
     path = checkpoint / POLICY
     if not path.exists():
         raise ConfigError(
-            f"checkpoint {checkpoint}: has no {POLICY}, which this version writes into every "
-            "checkpoint; `gmijax play` plays it without"
+            f"checkpoint {nearby(checkpoint)}: has no {POLICY}, which this version writes into "
+            "every checkpoint; `gmijax play` plays it without"
         )
     return read_policy(path)
 

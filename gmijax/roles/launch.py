@@ -22,6 +22,7 @@ from gmijax.roles import shipping
 from gmijax.roles.manager import GMIManager
 from gmijax.roles.role import Role
 from gmijax.runs.folder import RunPaths, create_run, read_json, write_json
+from gmijax.runs.names import nearby
 from gmijax.supervise.child import ENV_GMI
 from gmijax.supervise.job_kinds import JobKind, pipes
 from gmijax.supervise.run_gmis import Launch, run_gmis
@@ -225,4 +226,4 @@ def _explain(error: GmijaxError, run: RunPaths) -> None:
             error.add_note(f"in GMI {gmi}:\n{read_json(run.gmi(gmi).error)['traceback'].rstrip()}")
         except (ConfigError, KeyError, AttributeError):
             continue
-    error.add_note(f"run folder: {run.root}")
+    error.add_note(f"run folder: {nearby(run.root)}")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from gmijax.config.schema import from_dict
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, DamagedFile
 from gmijax.runs.folder import (
     META,
     REMOVED,
@@ -22,7 +22,7 @@ from gmijax.runs.folder import (
     open_regular,
     read_json,
 )
-from gmijax.runs.names import by_steps, steps_name, steps_of
+from gmijax.runs.names import by_steps, nearby, steps_name, steps_of
 
 _CHUNK_BYTES: Final = 1 << 20
 
@@ -68,8 +68,9 @@ class CheckpointMeta:
         """Reads the meta data of a checkpoint folder.
 
         Raises:
-          ConfigError: they are not those of a checkpoint.
+          DamagedFile: they are not those of a checkpoint.
         """
+        what = f"checkpoint {nearby(checkpoint)}: broken {META}"
         try:
             data = read_json(checkpoint / META)
             # Those of older versions have none.
@@ -77,9 +78,10 @@ class CheckpointMeta:
             if noted not in (None, _digest(data)):
                 raise ConfigError("not as it was written")
             return from_dict(cls, data)
+        except DamagedFile as error:
+            raise DamagedFile(what, error.cause) from None
         except ConfigError as error:
-            why = str(error).removeprefix(f"{checkpoint / META}: ")
-            raise ConfigError(f"checkpoint {checkpoint}: broken {META} ({why})") from None
+            raise DamagedFile(what, str(error)) from None
 
 
 def _digest(data: Mapping[str, Any]) -> str:
@@ -95,7 +97,9 @@ class NewestCheckpoint(NamedTuple):
     @property
     def passed_over(self) -> tuple[str, ...]:
         """The broken ones, each in a sentence for the user."""
-        return tuple(f"checkpoint {path}: passed over, {wrong}" for path, wrong in self.broken)
+        return tuple(
+            f"checkpoint {nearby(path)}: passed over, {wrong}" for path, wrong in self.broken
+        )
 
 
 def checkpoints_of(folder: Path) -> list[Path]:
@@ -132,15 +136,15 @@ def none_is_whole(found: NewestCheckpoint) -> str:
     """Says that no checkpoint is whole, and what is wrong with the newest of those there are."""
     (newest, wrong), *others = found.broken
     more = f" (and {len(others)} more)" if others else ""
-    return f"no checkpoint is whole: {newest}: {wrong}{more}"
+    return f"no checkpoint is whole: {nearby(newest)}: {wrong}{more}"
 
 
 def what_is_broken(checkpoint: Path) -> str | None:
     """Why a checkpoint cannot be used, None if its files are as they were written."""
     try:
         meta = CheckpointMeta.read(checkpoint)
-    except ConfigError as error:
-        return str(error).removeprefix(f"checkpoint {checkpoint}: ")
+    except DamagedFile as error:
+        return f"broken {META} ({error.cause})"
     if steps_of(checkpoint.name) not in (None, meta.env_steps):  # A copy under such a name.
         return f"{META} is that of {steps_name(meta.env_steps)}"
     return next(

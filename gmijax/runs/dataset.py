@@ -14,12 +14,17 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from gmijax.errors import ConfigError
+from gmijax.config.schema import flatten
+from gmijax.errors import ConfigError, DamagedFile
 from gmijax.runs.folder import read_json, write_json
+from gmijax.runs.names import nearby
 
 _DIGITS = 6
+
+_MOST_SHOWN: Final = 3
+"""Settings that one line names."""
 
 
 @dataclass(frozen=True)
@@ -90,21 +95,33 @@ def open_dataset(paths: DataPaths, about: Mapping[str, Any]) -> None:
             _check_same(paths, about)
         elif paths.root.exists() and any(paths.root.iterdir()):
             raise ConfigError(
-                f"output.dir={paths.root}: the folder is not empty and holds no experience "
-                f"({paths.dataset.name} is missing)"
+                f"output.dir={nearby(paths.root)}: the folder is not empty and holds no "
+                f"experience ({paths.dataset.name} is missing)"
             )
         else:
             paths.root.mkdir(parents=True, exist_ok=True)
             write_json(paths.dataset, about)
     except OSError as error:
-        raise ConfigError(f"output.dir={paths.root}: {error.strerror}") from None
+        raise ConfigError(f"output.dir={nearby(paths.root)}: {error.strerror}") from None
 
 
 def _check_same(paths: DataPaths, about: Mapping[str, Any]) -> None:
     found = read_json(paths.dataset)
-    for key, wanted in about.items():
-        if found.get(key) != wanted:
-            raise ConfigError(
-                f"output.dir={paths.root}: holds experience with {key}={found.get(key)!r}, this "
-                f"job would add {wanted!r}; use another folder or the same settings"
-            )
+    for key, value in about.items():
+        if key not in found:
+            raise DamagedFile(f"{nearby(paths.dataset)}: broken", f"has no {key}")
+        if isinstance(value, Mapping) and not isinstance(found[key], Mapping):
+            raise DamagedFile(f"{nearby(paths.dataset)}: broken", f"{key} is no group of keys")
+    was, wanted = flatten({key: found[key] for key in about}), flatten(about)
+    differing = [
+        f"{key}={was.get(key)!r}, this job would add {wanted.get(key)!r}"
+        for key in dict.fromkeys((*wanted, *was))
+        if was.get(key) != wanted.get(key)
+    ]
+    if differing:
+        more = len(differing) - _MOST_SHOWN
+        shown = [*differing[:_MOST_SHOWN], *([f"and {more} more"] if more > 0 else [])]
+        raise ConfigError(
+            f"output.dir={nearby(paths.root)}: holds experience with {'; '.join(shown)}; use "
+            "another folder or the same settings"
+        )

@@ -15,8 +15,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from gmijax.errors import ConfigError
-from gmijax.runs.names import steps_name
+from gmijax.errors import ConfigError, DamagedFile
+from gmijax.runs.names import nearby, steps_name
 
 RUNS = Path("runs")
 """Where run folders go unless `run.dir` names one; relative to the working directory."""
@@ -260,11 +260,14 @@ def write_text(path: Path, text: str) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Has errors within name the file; those of writing to an open file name none."""
+    """Has errors within name the file: those of writing to an open file name none.
+
+    Those of replacing it name the other one first.
+    """
     try:
         yield
     except OSError as error:
-        error.filename = str(path)
+        error.filename, error.filename2 = str(path), None
         raise
 
 
@@ -277,11 +280,12 @@ def write_bytes(path: Path, content: bytes) -> None:
     path.parent.mkdir(exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
     try:
-        with naming(path), temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        with naming(path):
+            with temporary.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -298,7 +302,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Reads what `write_json` wrote.
 
     Raises:
-      ConfigError: it cannot be read, or is no JSON object; the message has the path.
+      DamagedFile: it cannot be read, or is no JSON object; the message has the path.
     """
     try:
         with open_regular(path) as file:
@@ -307,13 +311,14 @@ def read_json(path: Path) -> dict[str, Any]:
             raise OSError(errno.EFBIG, f"larger than {LARGEST_JSON_BYTES >> 20} MiB")
         data: object = json.loads(content)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+        why = error.strerror or str(error)
+        raise DamagedFile(f"{nearby(path)}: cannot be read", why) from None
     except RecursionError:
-        raise ConfigError(f"{path}: broken (nested too deeply)") from None
+        raise DamagedFile(f"{nearby(path)}: broken", "nested too deeply") from None
     except ValueError as error:  # Not JSON, or not even text.
-        raise ConfigError(f"{path}: broken (not JSON: {error})") from None
+        raise DamagedFile(f"{nearby(path)}: broken", f"not JSON: {error}") from None
     if not isinstance(data, dict):
-        raise ConfigError(f"{path}: broken (not a JSON object)")
+        raise DamagedFile(f"{nearby(path)}: broken", "not a JSON object")
     return typing.cast("dict[str, Any]", data)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from gmijax.errors import BackendUnavailable, ConfigError, FolderLost, JobInterrupted
+from gmijax.runs.names import nearby
 
 _GONE: Final = (errno.ENOENT, errno.ENOTDIR, errno.ESTALE)
 """Errors of a path that leads nowhere; others, of a network for one, say nothing."""
@@ -51,7 +52,7 @@ class OpenFolder:
         if self.is_there():
             return
         now = self._now()
-        where = "was removed or replaced" if now is None else f"was moved to {now}"
+        where = "was removed or replaced" if now is None else f"was moved to {nearby(now)}"
         use = "" if now is None else "; what it has can be used there"
         raise FolderLost(f"{self._what}: the folder {where} while a job wrote into it{use}")
 

@@ -60,7 +60,7 @@ def _named(folder: Path, form: str) -> list[Path]:
     except (FileNotFoundError, NotADirectoryError):
         return []
     except OSError as error:
-        raise ConfigError(f"{folder}: cannot be read ({error.strerror})") from None
+        raise ConfigError(f"{nearby(folder)}: cannot be read ({error.strerror})") from None
     return [folder / name for name in names if re.fullmatch(form, name)]
 
 
@@ -69,6 +69,17 @@ def nearby(path: Path) -> str:
     with suppress(ValueError, OSError):
         return str(path.relative_to(Path.cwd()))
     return str(path)
+
+
+def as_typed(program: str) -> str:
+    """A program as it is typed from the working directory.
+
+    With `./` where it would be one of PATH without.
+    """
+    if not os.path.isabs(program):
+        return program
+    short = nearby(Path(program))
+    return short if os.sep in short else os.path.join(os.curdir, short)
 
 
 def counted(count: int, what: str) -> str:

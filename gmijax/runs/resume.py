@@ -13,6 +13,7 @@ from gmijax.runs.checkpoints import (
     CheckpointMeta,
     checkpoints_of,
     newest_checkpoint,
+    none_is_whole,
     what_is_broken,
 )
 from gmijax.runs.folder import META, RUNS, RunPaths, read_json, why_no_folder
@@ -50,9 +51,8 @@ def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
     if found.checkpoint is None:
         if not found.passed_over and is_training(folder):
             raise NoCheckpointYet(f"{key}={wanted}: {first_checkpoint_of(folder)}", folder)
-        raise ConfigError(
-            "; ".join((f"{key}={wanted}: {_no_checkpoint(folder)}", *found.passed_over))
-        )
+        why = none_is_whole(found) if found.broken else _no_checkpoint(folder)
+        raise ConfigError(f"{key}={wanted}: {why}")
     return found.checkpoint, found.passed_over
 
 

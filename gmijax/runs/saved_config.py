@@ -13,6 +13,7 @@ from gmijax.config.removed import REMOVED, without_removed
 from gmijax.config.schema import flatten, from_dict, from_named, known, to_dict
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.names import nearby
 from gmijax.runs.resume import any_checkpoint
 
 _OWN_KEYS: Final = ("run.dir", "run.name", "run.resume", "run.profile", "env.source_sha256")
@@ -37,7 +38,7 @@ def saved_config(checkpoint: Path) -> dict[str, Any]:
     run = RunPaths(checkpoint.parent.parent)
     if not os.path.lexists(run.config):
         raise ConfigError(
-            f"checkpoint {checkpoint}: no config.json in {run.root}; "
+            f"checkpoint {nearby(checkpoint)}: no config.json in {nearby(run.root)}; "
             "a checkpoint can only be used in its run folder"
         )
     return config_of_run(run)
@@ -54,20 +55,53 @@ def config_of_run(run: RunPaths) -> dict[str, Any]:
     """
     saved = without_removed(read_json(run.config))
     if not all(isinstance(saved.get(group), dict) for group in ("env", "algo", "run")):
-        raise ConfigError(f"{run.config}: not the configuration of a training run")
+        raise ConfigError(f"{nearby(run.config)}: not the configuration of a training run")
     if saved["env"].get("suite") == "custom":
         # A file of which nothing is noted is none that can be recognised.
         saved["env"]["source_sha256"] = saved["env"].get("source_sha256") or ""
     return saved
 
 
+def require_own_values(
+    config: Mapping[str, Any], run: RunPaths, command: Mapping[str, Any], saved: Mapping[str, Any]
+) -> None:
+    """Blames the file of a run for a wrong value that a training which goes on takes from it.
+
+    Args:
+      config: of the training, as plain data.
+      run: whose file it is.
+      command: the same without what the run has saved.
+      saved: the same without what the command line says otherwise.
+
+    Raises:
+      ConfigError: names the file; what the command line says wrongly is found later.
+    """
+    wrong = _why_wrong(config)
+    if wrong is not None and wrong == _why_wrong(saved) and wrong != _why_wrong(command):
+        raise ConfigError(f"{nearby(run.config)}: {wrong}")
+
+
+def _why_wrong(config: Mapping[str, Any]) -> str | None:
+    try:
+        from_dict(TrainConfig, config)
+    except ConfigError as error:
+        return str(error)
+    return None
+
+
 def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
     """Task and algorithm of the run that a checkpoint lies in.
 
     Raises:
-      ConfigError: the checkpoint does not lie in the folder of a training run.
+      ConfigError: the checkpoint does not lie in the folder of a training run, or its file has a
+        wrong value of them.
     """
-    return task_and_algorithm(saved_config(checkpoint))
+    saved = saved_config(checkpoint)
+    try:
+        return task_and_algorithm(saved)
+    except ConfigError as error:
+        file = nearby(RunPaths(checkpoint.parents[1]).config)
+        raise ConfigError(f"{file}: {error}") from None
 
 
 def task_and_algorithm(saved: Mapping[str, Any]) -> tuple[EnvConfig, AlgoConfig]:
@@ -85,7 +119,11 @@ def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
 
     To train on without them would be another training. Policies act without, see `trained_config`.
     """
-    if unknown := _unknown_keys(saved):
+    try:
+        unknown = _unknown_keys(saved)
+    except ConfigError as error:
+        raise ConfigError(f"{what}: its config.json: {error}") from None
+    if unknown:
         write = [f"{key}: {REMOVED[key].write}" for key in flatten(saved) if key in REMOVED]
         raise ConfigError(
             f"{what}: its config.json has keys that this version does not know: {unknown}; take "

@@ -17,6 +17,7 @@ from typing import Any
 
 from gmijax.config import EnvConfig
 from gmijax.errors import ConfigError
+from gmijax.runs.names import nearby
 
 
 def split(name: str) -> tuple[Path, str]:
@@ -29,7 +30,7 @@ def split(name: str) -> tuple[Path, str]:
     if not (colon and path.endswith(".py") and function.isidentifier()):
         raise ConfigError(f"env={name}: expected PATH.py:FUNCTION, e.g. path/to/cart.py:make")
     if not os.path.isfile(path):  # Unlike `Path.is_file` it takes any text.
-        raise ConfigError(f"env={name}: no such file {Path(path).absolute()}")
+        raise ConfigError(f"env={nearby(Path(name))}: no such file")
     return Path(path).resolve(), function
 
 
@@ -67,14 +68,14 @@ def pinned(env: EnvConfig) -> EnvConfig:
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
-        raise ConfigError(f"env={path}: cannot be read ({error.strerror})") from None
+        raise ConfigError(f"env={nearby(path)}: cannot be read ({error.strerror})") from None
     if env.source_sha256 not in (None, digest):
         # To open a run is not to say that whatever its file holds by now may be executed.
         how = "has changed" if env.source_sha256 else "may have changed"
-        key = shlex.quote(f"env={path}:{function}")
+        key = shlex.quote(f"env={nearby(path)}:{function}")
         raise ConfigError(
-            f"{path} {how} since this run was trained, so it was not executed. To use the file as "
-            f"it is now, add {key}"
+            f"{nearby(path)} {how} since this run was trained, so it was not executed. To use "
+            f"the file as it is now, add {key}"
         )
     return dataclasses.replace(env, name=f"{path}:{function}", source_sha256=digest)
 
@@ -101,7 +102,7 @@ def executed(env: EnvConfig) -> str | None:
     """Names the file that opening a saved run executes, None where its task has none."""
     if env.suite != "custom":
         return None
-    return f"custom task: this executes {env.name}, the file of the run's task"
+    return f"custom task: this executes {nearby(Path(str(env.name)))}, the file of the run's task"
 
 
 def changes(env: EnvConfig, saved: Mapping[str, Any]) -> str | None:
@@ -116,4 +117,4 @@ def changes(env: EnvConfig, saved: Mapping[str, Any]) -> str | None:
     """
     if env.source_sha256 in (None, saved.get("source_sha256")):
         return None
-    return f"custom task: {env.name} has changed since the run was started"
+    return f"custom task: {nearby(Path(str(env.name)))} has changed since the run was started"

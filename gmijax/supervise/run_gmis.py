@@ -17,6 +17,7 @@ from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
 from gmijax.partition.plan import Plan
 from gmijax.runs.cache import drop_broken_programs
 from gmijax.runs.folder import RunPaths, read_json, write_json
+from gmijax.runs.names import nearby
 from gmijax.supervise.backends import Backend, open_backend
 from gmijax.supervise.child import ENV_EXCHANGE_FD
 from gmijax.supervise.job_kinds import JobKind
@@ -99,7 +100,7 @@ def recorded(
     except (FolderLost, ConfigError):
         raise  # What is wrong with the input is in the message alone.
     except GmijaxError as error:
-        error.add_note(f"run folder: {run.root}")
+        error.add_note(f"run folder: {nearby(run.root)}")
         raise
     finally:
         try:
@@ -108,7 +109,8 @@ def recorded(
             # A full disk must not hide why a job failed; nor may what is not written be read.
             if status == "completed":
                 why = getattr(error, "strerror", None) or error
-                raise GmijaxError(f"the outcome cannot be written to {run.root} ({why})") from None
+                where = nearby(run.root)
+                raise GmijaxError(f"the outcome cannot be written to {where} ({why})") from None
 
 
 def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:

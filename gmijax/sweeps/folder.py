@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from gmijax.control.exit_codes import OF_KINDS
 from gmijax.errors import ConfigError, FolderLost, SweepFailed
 from gmijax.runs.folder import create_run, given_run, holds_something_else
 from gmijax.runs.held import is_locked
+from gmijax.runs.names import nearby
 from gmijax.sweeps.any_job import J
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.work import Work
@@ -49,11 +51,24 @@ def _found(folder: Path, work: Work[J]) -> Path:
     return paths.root
 
 
+def require_folders(paths: SweepPaths, numbers: Iterable[int]) -> None:
+    """Raises ConfigError where something else stands in place of the folder of a job."""
+    for number in numbers:
+        for folder in (paths.run_dir(number), paths.job(number).root, paths.log(number).parent):
+            if os.path.lexists(folder) and not folder.is_dir():
+                raise ConfigError(f"{nearby(folder)}: is not a folder")
+
+
 @contextmanager
 def errors_of_files(paths: SweepPaths) -> Iterator[None]:
-    """Turns an error of a file, such as a full disk, into one line."""
+    """Turns an error of a file into one line.
+
+    Raises:
+      ConfigError: a folder stands in place of a file, or a file in place of a folder.
+      SweepFailed: anything else, such as a full disk.
+    """
     try:
         yield
     except OSError as error:
-        where = error.filename or paths.root
-        raise SweepFailed(f"{where}: {error.strerror or error}") from error
+        text = f"{nearby(Path(error.filename or paths.root))}: {error.strerror or error}"
+        raise (ConfigError if error.errno in OF_KINDS else SweepFailed)(text) from error

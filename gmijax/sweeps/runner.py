@@ -6,7 +6,7 @@ import json
 import os
 import shlex
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
@@ -21,7 +21,7 @@ from gmijax.runs.held import OpenFolder, locked
 from gmijax.supervise.stop_signals import StopSignals, stop_signals
 from gmijax.sweeps.any_job import J
 from gmijax.sweeps.events import JobEvents
-from gmijax.sweeps.folder import errors_of_files, opened_folder
+from gmijax.sweeps.folder import errors_of_files, opened_folder, require_folders
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.nodes import Host, nodes_of
 from gmijax.sweeps.paths import ENV_PACK_DIR, SweepPaths
@@ -31,7 +31,7 @@ from gmijax.sweeps.slots import Site, SlotPool
 from gmijax.sweeps.study import OptunaStudy, Study, optuna_package
 from gmijax.sweeps.view import SweepView
 from gmijax.sweeps.words import announce, print_outcome
-from gmijax.sweeps.work import Work
+from gmijax.sweeps.work import Work, name_of_request
 
 _LEASE_POLL_S = 0.2
 
@@ -73,7 +73,7 @@ def run_work(work: Work[J], *, show: Show = False, events: TextIO | None = None)
             optuna_package()
         with (
             opened_folder(work) as paths,
-            locked(paths.lock, f"run.dir={paths.root}") as folder,
+            locked(paths.lock, f"run.dir={nearby(paths.root)}") as folder,
         ):
             return _run(work, hosts, paths, folder, console, started_s, events)
 
@@ -97,7 +97,7 @@ def _run(
     job_events = JobEvents(events, work.name, jobs, paths)
     try:
         with errors_of_files(paths):
-            _run_jobs(work, hosts, paths, console, study, report, view, jobs, job_events)
+            said = _run_jobs(work, hosts, paths, console, study, report, view, jobs, job_events)
     except BaseException as error:
         status = "interrupted" if isinstance(error, JobInterrupted) else "failed"
         if (wrong := report.end(status)) is not None:
@@ -108,7 +108,8 @@ def _run(
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
     job_events.end(report.data)
-    print_outcome(console, report.data, work.ranking, paths, view.line(), work.hint(report.data))
+    hint = "" if said else work.hint(report.data)
+    print_outcome(console, report.data, work.ranking, paths, view.line(), hint)
     _require_success(failed, len(jobs), wrong, paths)
     if ranking := report.data["ranking"]:
         print_next(console, work.next_step(paths, ranking[0]))
@@ -153,8 +154,8 @@ def _run_jobs(
     view: SweepView,
     jobs: list[J],
     job_events: JobEvents,
-) -> None:
-    """Runs the jobs; returns when all have ended."""
+) -> str:
+    """Runs the jobs; returns when all have ended, with the hint that was printed meanwhile."""
     with stop_signals() as signals, ExitStack() as held:
         _lease(work, hosts, work.sites(hosts), console, signals)
         work = work.decided(hosts, console, signals, paths.root if hosts[0].name else None)
@@ -173,7 +174,7 @@ def _run_jobs(
         def tick() -> None:
             report.update()
             if not hinted and (hint := work.hint(report.data)):
-                hinted.append(hint)  # At the end it is said once more.
+                hinted.append(hint)
                 console.print(hint)
             view.update(signals.name)
             job_events.update()
@@ -191,6 +192,7 @@ def _run_jobs(
         ).run(signals)
     if not jobs:
         raise ConfigError(f"{work.name}: no trial had values that are allowed together")
+    return "".join(hinted)
 
 
 @contextmanager
@@ -225,8 +227,8 @@ def _lease(
         while (other := host.lease(devices)) is not None:
             if (pack := os.environ.get(ENV_PACK_DIR)) is not None:
                 raise ConfigError(
-                    f"gmijax {work.name} cannot be a job of a pack: this one belongs to {pack}, "
-                    "which holds the GPU already; use gmijax train in it"
+                    f"gmijax {work.name} cannot be a job of a pack: this one belongs to "
+                    f"{nearby(Path(pack))}, which holds the GPU already; use gmijax train in it"
                 )
             if other != announced:
                 console.print(f"another {work.name} has {other}: waiting until it ends")
@@ -243,18 +245,13 @@ def _beginning(work: Work[J], paths: SweepPaths, console: Console) -> tuple[list
       ConfigError: the folder holds others, or a package is missing.
     """
     settings, wanted = work.settings, json.loads(json.dumps(work.identity()))
-    if paths.request.exists() and (held := read_json(paths.request)) != wanted:
-        if (name := "pack" if "commands" in held else "sweep") != work.name:
-            raise ConfigError(f"run.dir={paths.root}: holds a {name}; give another folder")
-        raise ConfigError(
-            f"run.dir={paths.root}: holds another {name}; give the same "
-            f"{work.resume_requirement}, or another folder"
-        )
+    _require_same(work, wanted, paths)
     study = Study[J]()
     jobs = list(work.jobs)
     if settings.sampler != "grid":
         study = OptunaStudy(settings, work.space, work.make_job, paths.study, console.print)
         jobs = study.earlier()
+    require_folders(paths, [job.number for job in jobs])
     for job in jobs:
         run = paths.job(job.number)
         job.progress.read(run, work.ranking)
@@ -264,3 +261,24 @@ def _beginning(work: Work[J], paths: SweepPaths, console: Console) -> tuple[list
             job.progress.take_summary(read_json(run.summary))
     write_json(paths.request, wanted)
     return jobs, study
+
+
+def _require_same(work: Work[J], wanted: Mapping[str, Any], paths: SweepPaths) -> None:
+    """Raises ConfigError if a folder holds other jobs, or does not say which it holds."""
+    if not paths.request.exists():
+        return
+    elsewhere = "give another folder"
+    try:
+        held = read_json(paths.request)
+    except ConfigError as error:
+        raise ConfigError(f"{error}; {elsewhere}") from None
+    if (name := name_of_request(held)) is None:
+        broken = f"{nearby(paths.request)}: broken (not what a sweep or a pack was asked)"
+        raise ConfigError(f"{broken}; {elsewhere}")
+    if name != work.name:
+        raise ConfigError(f"run.dir={nearby(paths.root)}: holds a {name}; {elsewhere}")
+    if held != wanted:
+        raise ConfigError(
+            f"run.dir={nearby(paths.root)}: holds another {name}; give the same "
+            f"{work.resume_requirement}, or another folder"
+        )

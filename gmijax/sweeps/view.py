@@ -88,7 +88,9 @@ class SweepView:
             state, _, waits_for = now = job.progress.stage
             self._stages[job.number] = now
             is_due = state == "failed" or waits_for or not self._display.has_panel
-            if now != before and is_due:
+            # What an earlier command has done is no news, and took no time of this one.
+            is_earlier = state in ("completed", "pruned") and job.progress.started_s is None
+            if now != before and is_due and not is_earlier:
                 self._console.print(self._change(job, job.progress))
 
     def _change(self, job: AnyJob, progress: Progress) -> str:

@@ -157,3 +157,13 @@ class Work(ABC, Generic[J]):
             return {"jobs": [dict(job.overrides) for job in self.jobs]}
         sampler = {"sampler": self.settings.sampler, "seed": self.settings.seed}
         return sampler | {"space": {key: list(values) for key, values in self.space.items()}}
+
+
+def name_of_request(held: Mapping[str, Any]) -> str | None:
+    """The command whose `Work.identity` a folder holds; None: it is not one."""
+    commands = held.get("commands", [])
+    if not isinstance(commands, list) or not isinstance(held.get("jobs", []), list):
+        return None
+    if not held.keys() & {"jobs", "sampler"}:
+        return None
+    return "pack" if "commands" in held else "sweep"

@@ -27,6 +27,7 @@ from gmijax.runs.checkpoints import CheckpointMeta, file_check, newest_checkpoin
 from gmijax.runs.folder import META, RunPaths, open_regular, read_json, write_json
 from gmijax.runs.held import locked
 from gmijax.runs.history import copy_history, read_metrics
+from gmijax.runs.saved_config import trained_config
 from gmijax.sweeps.jobs import state_of
 from gmijax.sweeps.progress import Progress
 
@@ -221,6 +222,77 @@ def test_an_algorithm_that_is_no_name_is_one_line(run: RunPaths, name: object):
     write_json(run.config, saved)
     with pytest.raises(ConfigError, match=r"algo\.name="):
         find_start_point(compose("env=ant", f"run.resume={run.root}"))
+
+
+def edited(run: RunPaths, key: str, value: object) -> None:
+    """Writes a value into the configuration that a run has saved."""
+    saved = read_json(run.config)
+    group, _, name = key.rpartition(".")
+    (saved[group] if group else saved)[name] = value
+    write_json(run.config, saved)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("num_envs", "x", "num_envs=x: expected an integer or auto"),
+        ("num_envs", -5, "num_envs=-5: must be "),
+        ("run.grace_s", None, "run.grace_s=None: expected a finite number"),
+        ("algo.learning_rate", "fast", "algo.learning_rate=fast: expected a finite number"),
+        ("env.episode_length", 0, "env.episode_length=0: must be at least 1"),
+    ],
+)
+@pytest.mark.parametrize("resume", ["auto", "run"])
+def test_a_wrong_value_that_a_run_has_saved_is_not_blamed_on_the_command(
+    resume: str,
+    key: str,
+    value: object,
+    said: str,
+    run: RunPaths,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.chdir(run.root.parent)
+    folder = ("env=ant", "run.dir=run") if resume == "auto" else ()
+    edited(run, key, value)
+    with pytest.raises(ConfigError) as error:
+        compose(*folder, f"run.resume={resume}")
+    assert str(error.value).startswith(f"run/config.json: {said}")
+
+
+def test_an_algorithm_without_a_name_is_blamed_on_the_file(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(run.root.parent)
+    edited(run, "algo", {"name": "sca"})
+    said = r"^run\.resume=run: its config\.json: algo\.name=sca: expected one of ppo, "
+    with pytest.raises(ConfigError, match=said):
+        compose("run.resume=run")
+
+
+def test_a_wrong_value_of_the_command_is_not_blamed_on_the_file(run: RunPaths):
+    said = r"^num_envs=x: expected an integer or auto$"
+    with pytest.raises(ConfigError, match=said):
+        compose(f"run.resume={run.root}", "num_envs=x")
+    edited(run, "num_envs", "y")
+    with pytest.raises(ConfigError, match=said):
+        compose(f"run.resume={run.root}", "num_envs=x")
+    assert compose(f"run.resume={run.root}", "num_envs=8").num_envs == 8, "it is mended by it"
+
+
+def test_a_policy_needs_of_its_run_only_task_and_algorithm(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(run.root.parent)
+    edited(run, "num_envs", "x")
+    assert trained_config(run.checkpoint(100))[0].name == "ant"
+    edited(run, "env.episode_length", "x")
+    said = r"^run/config\.json: env\.episode_length=x: expected an integer or null$"
+    for command in (
+        lambda: trained_config(run.checkpoint(100)),
+        lambda: compose("run.dir=run", command="serve"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            command()
 
 
 BAD_LINES = ("5", "[]", "{}", "null", '"x"', "{", '{"env_steps": "9"}', '{"env_steps": true}')

@@ -52,6 +52,20 @@ def test_the_file_that_was_to_be_written_is_named(
     assert list(tmp_path.iterdir()) == [folder]
 
 
+def test_the_file_that_cannot_be_replaced_is_named_as_it_is_typed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "pack.json"
+    folder.mkdir()
+    with pytest.raises(IsADirectoryError) as error:
+        write_json(folder, {})
+    # Whoever looks at the first name alone must not find that of the temporary file.
+    assert (error.value.filename, error.value.filename2) == (str(folder), None)
+    assert exit_code_of("pack", lambda: write_json(folder, {})) == 2
+    assert capsys.readouterr().err == "gmijax.pack: pack.json: Is a directory\n"
+
+
 def test_a_file_that_was_open_when_the_disk_was_full_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

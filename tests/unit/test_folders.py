@@ -9,7 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from supervision import machine, planned
 
+from gmijax.cli.compose import compose
+from gmijax.control import serving
 from gmijax.errors import ConfigError
 from gmijax.runs.dataset import DataPaths, open_dataset
 from gmijax.runs.folder import add_event, read_json, write_json
@@ -59,6 +62,72 @@ def test_only_the_same_experience_is_continued(tmp_path: Path):
         paths.dataset.write_text(content)
         with pytest.raises(ConfigError, match=r"dataset.json: broken \("):
             open_dataset(paths, {"seed": 1})
+
+
+ABOUT = {
+    "env": {"name": "ant", "episode_length": 500, "rewards": {"near": 1.0}},
+    "seed": 1,
+    "num_envs": 4,
+}
+
+
+def test_of_other_settings_only_those_that_differ_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    paths = DataPaths(tmp_path / "data")
+    open_dataset(paths, ABOUT)
+
+    def refused(**changes: object) -> str:
+        with pytest.raises(ConfigError) as error:
+            open_dataset(paths, {**ABOUT, **changes})
+        return str(error.value)
+
+    of_env = {"name": "ant", "episode_length": 400, "rewards": {"near": 1.0}}
+    advice = "use another folder or the same settings"
+    assert refused(env=of_env) == (
+        "output.dir=data: holds experience with env.episode_length=500, this job would add 400; "
+        f"{advice}"
+    )
+    other = {"name": "go1", "episode_length": 400, "rewards": {"far": 2.0}}
+    assert refused(env=other, num_envs=8) == (
+        "output.dir=data: holds experience with env.name='ant', this job would add 'go1'; "
+        "env.episode_length=500, this job would add 400; env.rewards.far=None, this job would add "
+        f"2.0; and 2 more; {advice}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        ({"seed": 1}, "has no env"),
+        ({"env": 5, "seed": 1, "num_envs": 4}, "env is no group of keys"),
+        ({"env": None, "seed": 1, "num_envs": 4}, "env is no group of keys"),
+        ({"env": ABOUT["env"], "seed": 1}, "has no num_envs"),
+    ],
+)
+def test_a_data_set_without_its_keys_is_damaged(
+    content: dict[str, object], why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    write_json(tmp_path / "dataset.json", content)
+    with pytest.raises(ConfigError, match=rf"^dataset\.json: broken \({why}\)$"):
+        open_dataset(DataPaths(tmp_path), ABOUT)
+
+
+def test_an_interrupted_job_names_the_folder_of_its_shards_if_there_are_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    sizes = ("num_envs=4", "unroll_length=5", "num_timesteps=40")
+    config = compose("policy=random", "env=ant", *sizes, command="serve")
+    plan, data = planned(machine(0), backend="cpu"), DataPaths(tmp_path / "data")
+    job = serving._ServingJob(config, plan, machine(0), (0,), data, ())
+    assert serving._what_is_left(job) == "no shard was finished; the same command begins again"
+    make_shard(data, 0, 0)
+    assert serving._what_is_left(job) == (
+        "1 of 2 shards are in data; the same command makes the rest"
+    )
 
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path: Path):

@@ -25,7 +25,7 @@ from gmijax.machine.mps_control import MEMORY_LIMIT_VARIABLE, PIPE_VARIABLE
 from gmijax.machine.nvidia import GpuLoad, MigInstance
 from gmijax.machine.snapshot import DAEMONS_VARIABLE, Machine
 from gmijax.packs import slot_limiter
-from gmijax.packs.command_job import CommandJob
+from gmijax.packs.command_job import CommandJob, require_programs
 from gmijax.packs.command_kind import CommandKind, PackPaths
 from gmijax.packs.failure import failure_of
 from gmijax.packs.pack import PackWork
@@ -78,6 +78,32 @@ def test_copies_and_a_file_of_commands(tmp_path: Path) -> None:
         ("true", "--name", "a b"),
         ("true", "/f"),
     ]
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("./nosuch.sh", "./nosuch.sh"),
+        ("sub/nosuch.sh", "sub/nosuch.sh"),
+        ("{here}/nosuch.sh", "./nosuch.sh"),
+        ("/nowhere/nosuch.sh", "/nowhere/nosuch.sh"),
+        ("nosuch", "nosuch"),
+    ],
+)
+def test_a_program_that_is_not_there_is_named_as_it_was_typed(
+    command: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    command = command.replace("{here}", str(tmp_path))
+    Path("cmds.txt").write_text(f"# all of them\ntrue\n\n{command} --seed 0\n{command}\n")
+    what = f"{said}: no such program, or it cannot be executed"
+    for work, where in (
+        (build_pack([], [command]), ""),
+        (build_pack(["pack.commands=cmds.txt"], []), "pack.commands=cmds.txt: line 4: "),
+    ):
+        with pytest.raises(ConfigError) as error:
+            require_programs(work.jobs, work.ranking)
+        assert str(error.value) == f"{where}{what}"
 
 
 def test_keys_that_hold_text_need_no_quotes_of_hydra() -> None:

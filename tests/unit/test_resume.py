@@ -164,7 +164,7 @@ def test_a_checkpoint_whose_files_are_not_as_written_is_passed_over(run: RunPath
     assert "learner/weights" in found.passed_over[0]
     shutil.rmtree(run.checkpoint(100))
     with pytest.raises(
-        ConfigError, match=r"no checkpoint in this folder; .* passed over, learner"
+        ConfigError, match=r"no checkpoint is whole: .*/000000002000: learner/weights"
     ):
         find_checkpoint(str(run.root), "run.resume")
 

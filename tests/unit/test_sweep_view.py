@@ -126,6 +126,20 @@ def test_without_a_terminal_every_change_is_a_line() -> None:
     assert lines[3:] == ["job 0 seed=0: failed: GMI 0 failed: NonFiniteError"]
 
 
+@pytest.mark.parametrize("state", ["completed", "pruned"])
+def test_what_an_earlier_command_has_done_is_no_news(state: Any) -> None:
+    said, (before, now) = io.StringIO(), jobs_of([compose(), compose("seed=1")])
+    before.progress.state = state
+    before.progress.take_summary({"wall_s": 7.0})
+    with view_on(said, [before, now]) as view:
+        view.update()
+        now.progress.begin("", None)
+        now.progress.state = state
+        view.update()
+    (line,) = said.getvalue().splitlines()
+    assert line.startswith(f"job 1 seed=1: {state} after 0 s; 2 {state}")
+
+
 def test_a_long_command_is_there_once() -> None:
     said, jobs = io.StringIO(), running_jobs()[:2]
     command = "python train.py --seed 7 " + "--more options " * 20
@@ -158,6 +172,7 @@ def test_a_value_of_a_window_that_is_not_full_is_marked_where_it_is_shown() -> N
     with view_on(interrupted, [job]) as view:
         view.update()
     assert "s, return 8 so far; " in interrupted.getvalue()
+    job.progress.begin("", None)
     job.progress.state = "completed"
     with view_on(said, [job]) as view:
         view.update()

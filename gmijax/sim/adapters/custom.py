@@ -19,6 +19,7 @@ import numpy as np
 from gmijax.config.schema import suggestion
 from gmijax.devices import require_32_bit
 from gmijax.errors import ConfigError
+from gmijax.runs.names import nearby
 from gmijax.sim.adapters.checks import attempt, check_env, check_start
 from gmijax.sim.adapters.neighbours import importable
 from gmijax.sim.interface import Env, EnvState
@@ -62,11 +63,11 @@ def make(
     given = {key: value for key, value in changes.items() if value}
     what = f"env={path.name}:{function}"
     with importable(path.parent):
-        module = attempt(f"env={path}", load_module, path, source_sha256)
+        module = attempt(f"env={nearby(path)}", load_module, path, source_sha256)
         found = getattr(module, function, None)
         if not callable(found):
             near = suggestion(function, _own_functions(module))
-            raise ConfigError(f"env={name}: no function {function} there{near}")
+            raise ConfigError(f"env={nearby(Path(name))}: no function {function} there{near}")
         for group in given:
             _require_argument(found, group, what)
         env = attempt(what, found, impl=impl, max_envs=max_envs, **given)
@@ -124,12 +125,12 @@ def load_module(path: Path, source_sha256: str | None) -> ModuleType:
     """Runs the file as a module."""
     text = path.read_bytes()
     if source_sha256 not in (None, hashlib.sha256(text).hexdigest()):
-        raise ConfigError(f"env={path}: has changed since the job was started")
+        raise ConfigError(f"env={nearby(path)}: has changed since the job was started")
     # A name of its own: a file called brax.py must not take the place of a package.
     name = f"gmijax_custom_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise ConfigError(f"env={path}: not a Python file")
+        raise ConfigError(f"env={nearby(path)}: not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     # What the digest was taken of, and not what lies in __pycache__ or was written meanwhile.
