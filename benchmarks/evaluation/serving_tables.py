@@ -14,7 +14,7 @@ from benchmarks.records import Call, calls_by_date
 
 Case: TypeAlias = Mapping[str, Any]
 
-TASKS = ("ant", "humanoid")
+TASKS = ("ant", "ball_balance", "humanoid")
 GMIS = (2, 3, 4, 8)
 """That share 8192 environments."""
 
