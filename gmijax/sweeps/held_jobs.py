@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
@@ -14,6 +15,11 @@ from gmijax.sweeps.paths import SweepPaths
 
 _SAID_AFTER_S: Final = 5.0
 """What was killed is gone by then, as a rule."""
+
+_ENDING_S: Final = 1.0
+"""For the end of a process that was just killed."""
+
+_POLL_S: Final = 0.05
 
 _LIMIT_S: Final = 120.0
 """For the end of what a machine that is gone, or a killed command, has left."""
@@ -65,6 +71,17 @@ class HeldJobs:
         job.progress.note = None
         was = f"; it was to run {job.progress.error}" if job.progress.error else ""
         return f"{_holds(self._paths.job(job.number).lock)}, then give the same command{was}"
+
+
+def left_behind(jobs: Iterable[AnyJob], paths: SweepPaths) -> list[str]:
+    """Which processes of jobs that were ended still run, in words: a text for each such job."""
+    locks = {job.number: paths.job(job.number).lock for job in jobs if job.progress.attempts}
+    deadline_s = running_s() + _ENDING_S
+    while held := {number: lock for number, lock in locks.items() if is_locked(lock)}:
+        if running_s() >= deadline_s:
+            break
+        time.sleep(_POLL_S)
+    return [f"job {number}: {_holds(lock)}" for number, lock in held.items()]
 
 
 def _holds(lock: Path) -> str:

@@ -22,6 +22,7 @@ from gmijax.supervise.stop_signals import StopSignals, stop_signals
 from gmijax.sweeps.any_job import J
 from gmijax.sweeps.events import JobEvents
 from gmijax.sweeps.folder import errors_of_files, opened_folder, require_folders
+from gmijax.sweeps.held_jobs import left_behind
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.nodes import Host, nodes_of
 from gmijax.sweeps.paths import ENV_PACK_DIR, SweepPaths
@@ -103,6 +104,8 @@ def _run(
         if (wrong := report.end(status)) is not None:
             error.add_note(wrong)
         job_events.end(report.data)
+        for left in left_behind(jobs, paths):
+            error.add_note(left)
         _say_how_to_continue(error, work, jobs, paths)
         raise
     failed = [job for job in jobs if job.progress.state == "failed"]

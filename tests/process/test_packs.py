@@ -273,6 +273,27 @@ def test_what_a_job_leaves_outside_its_group_is_named(
     assert job["error"].endswith("it was to run again, after exit code 3: " + f"pid {left[0]}")
 
 
+@pytest.mark.timeout(120)
+def test_a_stop_names_what_has_left_the_group_of_its_job(home: Path) -> None:
+    leaves = LEAVES.replace("sys.exit(3)", "time.sleep(600)")
+    words = ("pack.copies=2", "pack.jobs_per_gpu=2", "pack.stop_timeout_s=1", "run.dir=all")
+    job = start(*words, "--", sys.executable, "-c", leaves, cwd=home, command="pack")
+    logs = [home / "all" / f"{n:03d}" / "pack" / "output.log" for n in range(2)]
+    wait_until(
+        lambda: all(log.exists() and "pid " in log.read_text() for log in logs), 60.0, "both left"
+    )
+    left = [re.findall(r"^pid (\d+)", log.read_text(), re.MULTILINE)[0] for log in logs]
+    try:
+        job.send_signal(signal.SIGHUP)
+        assert job.wait(60) == 130
+    finally:
+        for pid in left:
+            os.kill(int(pid), signal.SIGKILL)
+    said = (home / "stderr.txt").read_text()
+    for number, pid in enumerate(left):
+        assert re.search(rf"job {number}: process {pid} .*: end it \(kill {pid}\)", said)
+
+
 @pytest.mark.parametrize("ends", ["before the pack", "after it"])
 def test_a_killed_pack_leaves_nothing_of_a_group_whose_leader_has_ended(
     ends: str, tmp_path: Path
