@@ -18,6 +18,7 @@ import pytest
 import gmijax
 from gmijax.errors import GmiFailed, JobInterrupted
 from gmijax.runs.folder import read_json
+from gmijax.runs.names import nearby
 from tests import role_cases
 from tests.supervision import CHECKOUT
 from tests.training_jobs import heartbeat_of, pids_of
@@ -103,7 +104,7 @@ def test_the_gmi_that_fails_is_named(ends: str, message: str, seen: str, tmp_pat
             three(), role_cases.Wait(), str(tmp_path), ends, run_dir=str(run), timeout_s=timeout_s
         )
     notes = "\n".join(caught.value.__notes__)
-    assert f"run folder: {run}" in notes
+    assert f"run folder: {nearby(run)}" in notes
     assert ends != "raise" or 'raise ZeroDivisionError("the sum is off")' in notes
     assert not pids_of(run)
     if seen:  # The others are ended by the controller, before they notice.

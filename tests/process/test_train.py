@@ -179,7 +179,7 @@ def test_a_killed_gmi_ends_the_job_and_is_named(tmp_path: Path) -> None:
     errors = (tmp_path / "stderr.txt").read_text().strip().splitlines()
     assert "GMI 1" in errors[0]
     assert "SIGKILL" in errors[0]
-    assert str(run) in errors[0]
+    assert "run folder: run" in errors[0]
     # What was saved before the fault is still whole, and there is no half of another one.
     assert find_checkpoint(str(run), "test").is_dir()
     assert _read(run / "summary.json")["status"] == "failed"
