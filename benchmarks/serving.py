@@ -28,7 +28,6 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RunPaths, read_json
 
 Summary = Mapping[str, Any]
-ENVS = "environments of all GMIs together"
 
 
 class Setting(NamedTuple):
@@ -126,7 +125,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--backends", nargs="+", default=["auto"], metavar="BACKEND")
     parser.add_argument("--templates", nargs="+", default=["tcg", "tdg"], choices=["tcg", "tdg"])
     parser.add_argument("--simulators", nargs="+", type=int, default=[1, 2, 4], metavar="M")
-    parser.add_argument("--envs", nargs="+", type=int, default=[8192], metavar="N", help=ENVS)
+    parser.add_argument(
+        "--envs", nargs="+", type=int, default=[8192], help="environments of all GMIs together"
+    )
     parser.add_argument("--impl", default="auto", choices=["auto", "jax", "warp"])
     parser.add_argument("--unroll-length", type=int, default=32)
     parser.add_argument("--unrolls", type=int, default=20, help="unrolls of every GMI")

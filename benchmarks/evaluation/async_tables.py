@@ -21,7 +21,7 @@ from benchmarks.evaluation.figures import (
     sources_of,
     summaries,
 )
-from benchmarks.evaluation.learning_tables import NEARLY, times_to
+from benchmarks.evaluation.learning_tables import NEARLY, reached
 from benchmarks.evaluation.paper import CHANNELS
 from benchmarks.evaluation.writer import Calls, Rows, newest, table, table_of_calls
 from benchmarks.records import Call
@@ -62,8 +62,7 @@ def several_learners() -> Rows:
     base = SUITES[LEARNERS][0].name
     final = rate(LEARNERS, base, "final_return")
     for case in (one.name for one in SUITES[LEARNERS]):
-        found = times_to(NEARLY * final.median, LEARNERS, case) if final else []
-        seconds = figure([one for one in found if one is not None])
+        seconds = reached(NEARLY * final.median, LEARNERS, case) if final else None
         acting, drawn = rate(LEARNERS, case), _drawn(case)
         yield [
             *(case, shown(acting, ",.0f"), shown(over(acting, rate(LEARNERS, base)))),

@@ -46,9 +46,7 @@ def claims() -> Values:
         "model_fit": model_fit(),
         "serving_templates": said_bounds(templates_gains()),
         "com": said_bounds(of_communication()),
-        "templates": said_bounds(
-            [ratio(f"templates-{task}", *TEMPLATES) for task in ("ant", "humanoid")]
-        ),
+        "templates": said_bounds([ratio(*cases) for cases in TEMPLATES.values()]),
         "search": searched(),
         "served_at_peak": said_bounds([peak_over_peak(task) for task in SERVED]),
         "served_over_one": said_bounds([mps_over_one(task, n) for task in SERVED for n in GMIS]),

@@ -42,16 +42,20 @@ MARKS = (
 def marks() -> Rows:
     """Seconds from the first report of a run alone on its GPU to a return that others publish."""
     for task, mark, published, case in MARKS:
-        found = times_to(mark, *case)
-        reached = [seconds for seconds in found if seconds is not None]
-        share = f"{len(reached)} of {len(found)}"
-        yield [task, f"{mark:,}", share, shown(figure(reached), ".1f"), published]
+        found, runs = reached(mark, *case), len(times_to(mark, *case))
+        share = f"{found.repeats if found else 0} of {runs}"
+        yield [task, f"{mark:,}", share, shown(found, ".1f"), published]
 
 
 def seconds_to_mark(task: str) -> Figure | None:
     """Seconds of training until a task reaches the return that Isaac Gym's authors give."""
-    ((mark, (file, case)),) = ((mark, case) for name, mark, _, case in MARKS if name == task)
-    times = [s for s in times_to(mark, file, case) if s is not None]
+    ((mark, case),) = ((mark, case) for name, mark, _, case in MARKS if name == task)
+    return reached(mark, *case)
+
+
+def reached(mark: float, file: str, case: str) -> Figure | None:
+    """Seconds of the runs that got there, see `times_to`."""
+    times = [seconds for seconds in times_to(mark, file, case) if seconds is not None]
     return figure(times, *sources_of(file))
 
 
@@ -62,34 +66,22 @@ def times_to(mark: float, file: str, case: str) -> list[float | None]:
     return [seconds_to(mark, curve) for curve in curves]
 
 
-def _gmis(task: str) -> tuple[str, str]:
-    """The cases of figure 9: in one process, and in four GMIs."""
-    one, four = (f"{task} {gmis} x {8192 // gmis}" for gmis in (1, 4))
-    return one, four
+def _gmis(task: str) -> tuple[tuple[str, str], ...]:
+    """File and cases of figure 9: in one process, and in four GMIs."""
+    return tuple((f"reward-{task}", f"{task} {gmis} x {8192 // gmis}") for gmis in (1, 4))
 
 
-def _seconds_alike(task: str) -> tuple[float | None, list[Figure | None], list[str]]:
-    """Nine tenths of what one process reaches; seconds to it in one process and in GMIs, in words.
-
-    Runs that never reach it have no seconds; the words say how many those are.
-    """
-    file, cases = f"reward-{task}", _gmis(task)
-    if (final := rate(file, cases[0], "final_return")) is None:
-        return None, [None, None], [NOT_MEASURED] * 2
-    mark = NEARLY * final.median
-    found = [times_to(mark, file, case) for case in cases]
-    reached = [[s for s in seconds if s is not None] for seconds in found]
-    figures = [figure(seconds, *sources_of(file)) for seconds in reached]
-    words = [
-        shown(one, ".1f") + (f", {len(did)} of {len(of)} runs" if len(did) < len(of) else "")
-        for one, did, of in zip(figures, reached, found, strict=True)
-    ]
-    return mark, figures, words
+def _mark(task: str) -> float | None:
+    """Nine tenths of what one process reaches."""
+    final = rate(*_gmis(task)[0], "final_return")
+    return NEARLY * final.median if final else None
 
 
 def seconds_over_one_process(task: str) -> Ratio | None:
     """Of four GMIs to the same return."""
-    one, four = _seconds_alike(task)[1]
+    if (mark := _mark(task)) is None:
+        return None
+    one, four = (reached(mark, *case) for case in _gmis(task))
     return over(four, one)
 
 
@@ -102,11 +94,20 @@ def seconds_over_one_process(task: str) -> Ratio | None:
 def reward() -> Rows:
     """The same training in one process and in four GMIs of the GPU."""
     for task in REWARD:
-        mark, _, cells = _seconds_alike(task)
-        file = f"reward-{task}"
-        finals = (shown(rate(file, case, "final_return"), ",.0f") for case in _gmis(task))
+        mark = _mark(task)
+        finals = (shown(rate(*case, "final_return"), ",.0f") for case in _gmis(task))
+        cells = (_seconds_to(mark, *case) for case in _gmis(task))
         gain = shown(seconds_over_one_process(task))
         yield [f"`{task}`", *finals, shown(mark, ",.0f"), *cells, gain]
+
+
+def _seconds_to(mark: float | None, file: str, case: str) -> str:
+    """With how many runs got there, if not all."""
+    if mark is None:
+        return NOT_MEASURED
+    found, runs = reached(mark, file, case), len(times_to(mark, file, case))
+    did = found.repeats if found else 0
+    return shown(found, ".1f") + (f", {did} of {runs} runs" if did < runs else "")
 
 
 def _of_algorithms() -> Calls:

@@ -45,7 +45,7 @@ def unplanned(said: Words = SAID, plan: Path = PLAN) -> Iterator[Finding]:
             if table == STRICT:
                 wanted = f"the front page wants commit and {LEAST} runs, and this is {evidence}"
                 yield Finding(f"table {table}", number, line, wanted)
-            elif missing := sorted(files - {*seldom}):
+            elif missing := sorted(files - seldom.keys()):
                 lacks = f"is {evidence}, and {plan.name} has no row of {', '.join(missing)}"
                 yield Finding(f"table {table}", number, line, lacks)
     for name, at in seldom.items():

@@ -123,12 +123,12 @@ def require_programs(jobs: Sequence[CommandJob], settings: PackConfig) -> None:
       ConfigError: names it.
     """
     path = settings.env.get("PATH")
-    seen: set[str] = set()
+    first: dict[str, CommandJob] = {}
     for job in jobs:
-        name = job.arguments(Path("{run_dir}"))[0]
-        if name in seen or "{run_dir}" in name:
+        first.setdefault(job.arguments(Path("{run_dir}"))[0], job)
+    for name, job in first.items():
+        if "{run_dir}" in name:
             continue
-        seen.add(name)
         if shutil.which(name, path=None if path is None else str(path)) is None:
             file = f"pack.commands={settings.commands}: line {job.line}: "
             raise ConfigError(

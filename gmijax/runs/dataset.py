@@ -19,7 +19,7 @@ from typing import Any, Final
 from gmijax.config.schema import flatten
 from gmijax.errors import ConfigError, DamagedFile
 from gmijax.runs.folder import read_json, write_json
-from gmijax.runs.names import nearby
+from gmijax.runs.names import nearby, shortened
 
 _DIGITS = 6
 
@@ -119,9 +119,7 @@ def _check_same(paths: DataPaths, about: Mapping[str, Any]) -> None:
         if was.get(key) != wanted.get(key)
     ]
     if differing:
-        more = len(differing) - _MOST_SHOWN
-        shown = [*differing[:_MOST_SHOWN], *([f"and {more} more"] if more > 0 else [])]
         raise ConfigError(
-            f"output.dir={nearby(paths.root)}: holds experience with {'; '.join(shown)}; use "
-            "another folder or the same settings"
+            f"output.dir={nearby(paths.root)}: holds experience with "
+            f"{shortened(differing, _MOST_SHOWN, '; ')}; use another folder or the same settings"
         )

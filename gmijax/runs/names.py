@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -80,6 +81,18 @@ def as_typed(program: str) -> str:
         return program
     short = nearby(Path(program))
     return short if os.sep in short else os.path.join(os.curdir, short)
+
+
+def shortened(
+    parts: Sequence[str], most: int, between: str = ", ", also: str | None = None
+) -> str:
+    """The first parts, and how many more there are: `a, b, and 3 more`.
+
+    `also` stands before the last one, if that is not as between the others.
+    """
+    more = len(parts) - most
+    end = f"{between if also is None else also}and {more} more" if more > 0 else ""
+    return f"{between.join(parts[:most])}{end}"
 
 
 def counted(count: int, what: str) -> str:

@@ -18,7 +18,7 @@ from gmijax.runs.checkpoints import (
 )
 from gmijax.runs.folder import META, RUNS, RunPaths, read_json, why_no_folder
 from gmijax.runs.held import is_locked
-from gmijax.runs.names import nearby
+from gmijax.runs.names import nearby, shortened
 
 _MOST_NAMED: Final = 5
 """Runs that one line names."""
@@ -76,9 +76,8 @@ def _no_checkpoint(folder: Path) -> str:
     jobs = sorted(path.name for path in _folders_in(folder) if checkpoints_of(path))
     if not jobs:
         return "no checkpoint in this folder"
-    more = f" and {len(jobs) - _MOST_NAMED} more" if len(jobs) > _MOST_NAMED else ""
-    named = ", ".join(jobs[:_MOST_NAMED])
-    return f"no checkpoint in this folder; runs in it that have some: {named}{more}"
+    named = shortened(jobs, _MOST_NAMED, also=" ")
+    return f"no checkpoint in this folder; runs in it that have some: {named}"
 
 
 def _named(wanted: str, key: str) -> Path:
@@ -148,9 +147,8 @@ def newer_than(checkpoint: Path) -> tuple[str, ...]:
             named.append(f"{folder} (no checkpoint)")
     if not named:
         return ()
-    more = f", and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
     run = nearby(checkpoint.parents[1])
-    return (f"last is {run}; newer, but passed over: {', '.join(named[:_MOST_NAMED])}{more}",)
+    return (f"last is {run}; newer, but passed over: {shortened(named, _MOST_NAMED)}",)
 
 
 def _is_unsaved_training(folder: Path) -> bool:

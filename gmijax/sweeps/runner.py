@@ -98,7 +98,7 @@ def _run(
     job_events = JobEvents(events, work.name, jobs, paths)
     try:
         with errors_of_files(paths):
-            said = _run_jobs(work, hosts, paths, console, study, report, view, jobs, job_events)
+            hinted = _run_jobs(work, hosts, paths, console, study, report, view, jobs, job_events)
     except BaseException as error:
         status = "interrupted" if isinstance(error, JobInterrupted) else "failed"
         if (wrong := report.end(status)) is not None:
@@ -111,7 +111,7 @@ def _run(
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
     job_events.end(report.data)
-    hint = "" if said else work.hint(report.data)
+    hint = "" if hinted else work.hint(report.data)
     print_outcome(console, report.data, work.ranking, paths, view.line(), hint)
     _require_success(failed, len(jobs), wrong, paths)
     if ranking := report.data["ranking"]:
@@ -157,8 +157,8 @@ def _run_jobs(
     view: SweepView,
     jobs: list[J],
     job_events: JobEvents,
-) -> str:
-    """Runs the jobs; returns when all have ended, with the hint that was printed meanwhile."""
+) -> bool:
+    """Runs the jobs; returns when all have ended, whether a hint was printed meanwhile."""
     with stop_signals() as signals, ExitStack() as held:
         _lease(work, hosts, work.sites(hosts), console, signals)
         work = work.decided(hosts, console, signals, paths.root if hosts[0].name else None)
@@ -195,7 +195,7 @@ def _run_jobs(
         ).run(signals)
     if not jobs:
         raise ConfigError(f"{work.name}: no trial had values that are allowed together")
-    return "".join(hinted)
+    return bool(hinted)
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from gmijax.player.policy import checkpoint_policy, read_policy
 from gmijax.runs.checkpoints import CheckpointMeta, newest_checkpoint, none_is_whole
 from gmijax.runs.folder import META, RunPaths, read_json, write_json
 from gmijax.runs.held import OpenFolder
-from gmijax.runs.names import as_typed, by_steps
+from gmijax.runs.names import as_typed, by_steps, shortened
 from gmijax.runs.resume import find_checkpoint
 from gmijax.runs.saved_config import config_of_run, saved_config
 from gmijax.sim.source import split
@@ -130,3 +130,17 @@ def test_a_program_of_the_working_directory_is_none_of_path(run: RunPaths) -> No
     assert as_typed(f"{run.root}/x.sh") == "td/x.sh"
     for program in ("python", "./x.sh", "/usr/bin/env"):
         assert as_typed(program) == program
+
+
+@pytest.mark.parametrize(
+    ("most", "between", "also", "wanted"),
+    [
+        (3, ", ", None, "a, b, c"),
+        (2, "; ", None, "a; b; and 1 more"),
+        (1, ", ", " ", "a and 2 more"),
+    ],
+)
+def test_a_line_lists_the_first_and_counts_the_others(
+    most: int, between: str, also: str | None, wanted: str
+):
+    assert shortened(["a", "b", "c"], most, between, also) == wanted
