@@ -36,7 +36,7 @@ def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     if exit_code == 0:
         console.print(f"page: {nearby(paths.html)}")
         return
-    reason = f"no page: {last_line(paths.page_log)} (log: {paths.page_log})"
+    reason = f"no page: {last_line(paths.page_log)} (log: {nearby(paths.page_log)})"
     if config.html == "on":
         raise GmijaxError(f"{reason}; the returns were evaluated")
     console.print(reason)
@@ -85,7 +85,7 @@ def film(
 def _why(exit_code: int, paths: PlayPaths) -> str:
     ended = f"the renderer was ended by {signal_name(-exit_code)}" if exit_code < 0 else ""
     said = last_line(paths.render_log)
-    return f"{': '.join(filter(None, (ended, said)))} (log: {paths.render_log})"
+    return f"{': '.join(filter(None, (ended, said)))} (log: {nearby(paths.render_log)})"
 
 
 def render(gl: str, paths: PlayPaths, seconds: float | None = None) -> int:

@@ -70,5 +70,7 @@ def play(paths: PlayPaths, seconds: float | None = None) -> None:
     if code == 2:
         raise ConfigError(last_line(log))
     if code:
-        raise GmijaxError(f"playing failed (exit code {code}): {last_line(log)} (log: {log})")
+        raise GmijaxError(
+            f"playing failed (exit code {code}): {last_line(log)} (log: {nearby(log)})"
+        )
     log.unlink()

@@ -229,11 +229,22 @@ def test_every_opengl_is_tried_the_users_first(
 def test_a_renderer_that_fails_for_another_reason_says_why(
     tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch, exit_code: int, why: str
 ):
+    monkeypatch.chdir(tmp_path)
     paths = PlayPaths(tmp_path)
     paths.render_log.write_text("Traceback\nOSError: disk full\n")
     monkeypatch.setattr(pictures, "render", lambda *_: exit_code)
-    with pytest.raises(GmijaxError, match=f"no video: {why}.*log: "):
+    with pytest.raises(GmijaxError, match=rf"no video: {why}.*\(log: render\.log\)"):
         pictures.film(config_of("video=auto"), paths, "camera track", quiet)
+
+
+def test_a_page_that_fails_names_its_log_from_the_working_directory(
+    tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(pictures, "missing", tuple)
+    monkeypatch.setattr(pictures, "run_child", lambda *_: 1)
+    with pytest.raises(GmijaxError, match=r"no page: .*\(log: page\.log\)"):
+        pictures.write_page(config_of("html=on"), PlayPaths(tmp_path), quiet)
 
 
 def test_without_opengl_only_a_film_that_was_asked_for_is_an_error(

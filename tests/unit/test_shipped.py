@@ -17,7 +17,7 @@ from gmijax.config import EnvConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.job import Result
 from gmijax.deploy import shipped as shipping
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, GmijaxError
 from gmijax.player import shipped
 from gmijax.player.plain_env import PlainEnv, task_of
 from gmijax.player.policy import PlainPolicy, write_policy
@@ -100,6 +100,15 @@ def test_a_shipped_policy_is_played_as_a_checkpoint_is(policies: Path):
     assert model.nq == 20
     # Another call leaves nothing of this one.
     assert not any(path.exists() for path in shipping.folder_of(config).results())
+
+
+def test_playing_that_fails_names_its_log_from_the_working_directory(
+    policies: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(shipping, "run_child", lambda *_: 1)
+    paths = shipping.folder_of(demo.play_config("ball_balance"))
+    with pytest.raises(GmijaxError, match=r"\(log: runs/shipped/ball_balance/stderr\.log\)$"):
+        shipping.play(paths)
 
 
 def test_without_time_only_as_many_are_played_as_are_filmed(policies: Path):
