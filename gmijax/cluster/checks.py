@@ -16,6 +16,7 @@ from gmijax.cluster.ray_nodes import NodeHandle
 from gmijax.errors import ConfigError
 from gmijax.machine.differences import differences_in
 from gmijax.machine.snapshot import Machine
+from gmijax.runs.names import nearby
 from gmijax.version import versions_of
 
 SHOWS_S = 20.0
@@ -54,6 +55,7 @@ def require_alike(joined: Sequence[NodeHandle]) -> None:
 
 def require_shared(joined: Sequence[NodeHandle], run_root: Path) -> None:
     """Raises ConfigError if a node does not see the run folder, or what will hold it."""
+    shown = f"run.dir={nearby(run_root)}"
     folder = run_root.absolute()
     while not folder.is_dir():
         folder = folder.parent
@@ -61,7 +63,7 @@ def require_shared(joined: Sequence[NodeHandle], run_root: Path) -> None:
     try:
         fd, name = tempfile.mkstemp(prefix=".gmijax-probe-", dir=folder)
     except OSError as error:
-        raise ConfigError(f"run.dir={run_root}: {folder}: {error.strerror}") from None
+        raise ConfigError(f"{shown}: {folder}: {error.strerror}") from None
     try:
         with os.fdopen(fd, "w") as file:
             file.write(content)
@@ -70,7 +72,7 @@ def require_shared(joined: Sequence[NodeHandle], run_root: Path) -> None:
         while blind := [node for node in blind if not node.call("sees", name, content)]:
             if running_s() > deadline_s or any(node.lost for node in blind):
                 raise ConfigError(
-                    f"run.dir={run_root}: node {blind[0].address} does not see {folder} or "
+                    f"{shown}: node {blind[0].address} does not see {folder} or "
                     "cannot write to it; the run folder must be on a file system that all "
                     "nodes share"
                 )

@@ -292,7 +292,10 @@ def test_a_run_folder_that_a_node_does_not_see_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gmijax.cluster.checks.SHOWS_S", 0.0)
-    with pytest.raises(ConfigError, match=r"node 10\.0\.0\.2 does not see .* or cannot write"):
+    monkeypatch.chdir(tmp_path)
+    # A node has another working directory, if any: what it is to see is named whole.
+    said = rf"^run\.dir=runs/new: node 10\.0\.0\.2 does not see {tmp_path} or cannot write"
+    with pytest.raises(ConfigError, match=said):
         require_shared(joined(a_node(sees=False)), tmp_path / "runs" / "new")
     require_shared(joined(a_node(sees=True)), tmp_path / "runs" / "new")
     assert not list(tmp_path.iterdir())
