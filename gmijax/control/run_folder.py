@@ -28,7 +28,7 @@ from gmijax.runs.folder import (
 )
 from gmijax.runs.git import record_git
 from gmijax.runs.held import OpenFolder, gone_if_unused, locked
-from gmijax.runs.history import copy_history, draw_returns, read_metrics
+from gmijax.runs.history import copy_history, draw_returns, last_env_steps
 from gmijax.runs.names import attempt_folders, gmi_folders
 from gmijax.runs.resume import choose_checkpoint
 from gmijax.runs.saved_config import saved_config
@@ -98,8 +98,8 @@ def begin_again(run: RunPaths, checkpoint: Path | None) -> None:
 
     What was trained there without a checkpoint is lost, but not its metrics.
     """
-    if checkpoint is None and (lines := read_metrics(run.metrics)):
-        run.metrics.rename(run.earlier_metrics(lines[-1]["env_steps"]))
+    if checkpoint is None and (steps := last_env_steps(run.metrics)) is not None:
+        run.metrics.rename(run.earlier_metrics(steps))
     clear_unfinished(run, checkpoint)
 
 

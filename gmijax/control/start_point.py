@@ -26,7 +26,7 @@ from gmijax.runs.folder import (
     replays_of,
     require_new_run,
 )
-from gmijax.runs.history import read_metrics
+from gmijax.runs.history import last_env_steps, read_metrics
 from gmijax.runs.names import nearby
 from gmijax.runs.result import summary_of
 from gmijax.runs.resume import choose_checkpoint
@@ -142,9 +142,8 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
 
 def _begins_anew(run: RunPaths) -> tuple[str, ...]:
     """Says what becomes of what was trained without a checkpoint; nothing where nothing was."""
-    if not (lines := read_metrics(run.metrics)):
+    if (steps := last_env_steps(run.metrics)) is None:
         return ()
-    steps = lines[-1]["env_steps"]
     kept = nearby(run.earlier_metrics(steps))
     return (
         f"warning: no checkpoint in {nearby(run.root)}, training starts at step 0; the metrics of "

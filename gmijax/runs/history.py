@@ -19,6 +19,12 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     return MetricsReader(path).new()
 
 
+def last_env_steps(path: Path) -> int | None:
+    """The environment steps of the last line of a `metrics.jsonl`; None without a line."""
+    line = MetricsReader(path).latest()
+    return None if line is None else line["env_steps"]
+
+
 def copy_history(source: Path, target: Path, env_steps: int) -> None:
     """Copies the lines up to `env_steps`, so that a resumed run has the whole curve.
 

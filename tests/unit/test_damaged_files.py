@@ -26,7 +26,7 @@ from gmijax.runs import folder
 from gmijax.runs.checkpoints import CheckpointMeta, file_check, newest_checkpoint, what_is_broken
 from gmijax.runs.folder import META, RunPaths, open_regular, read_json, write_json
 from gmijax.runs.held import locked
-from gmijax.runs.history import copy_history, read_metrics
+from gmijax.runs.history import copy_history, last_env_steps, read_metrics
 from gmijax.runs.saved_config import trained_config
 from gmijax.sweeps.jobs import state_of
 from gmijax.sweeps.progress import Progress
@@ -304,6 +304,7 @@ def test_what_is_no_line_of_metrics_is_passed_over(run: RunPaths, tmp_path: Path
     bad = [*BAD_LINES, *(f'{{"env_steps": 9, "return": {value}}}' for value in BAD_VALUES)]
     run.metrics.write_text("\n".join((*bad, "[" * 100_000, good, "")))
     assert read_metrics(run.metrics) == [json.loads(good)]
+    assert last_env_steps(run.metrics) == 10
     copy_history(run.metrics, tmp_path / "copy.jsonl", 100)
     assert (tmp_path / "copy.jsonl").read_text() == good + "\n"
     progress = Progress()
@@ -312,6 +313,7 @@ def test_what_is_no_line_of_metrics_is_passed_over(run: RunPaths, tmp_path: Path
     run.metrics.unlink()
     os.mkfifo(run.metrics)
     assert read_metrics(run.metrics) == []
+    assert last_env_steps(run.metrics) is None
 
 
 def test_a_summary_needs_nothing_of_the_last_line_but_its_steps(run: RunPaths):
