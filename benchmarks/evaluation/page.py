@@ -76,7 +76,7 @@ def front() -> Values:
         "ant": said(_brief(seconds_to_mark("ant")), ".1f"),
         "go1": said(_brief(go1), ".0f"),
         "go1_seeds": Said(go1_seeds, None),
-        "eight": said(_brief(eight_at_once(KEYS_OF_SWEEPS[STEPS]))),
+        "eight": said(eight_at_once(KEYS_OF_SWEEPS[STEPS])),
         "mjlab": {key: said(gain) for key, gain in eight_packed(MJLAB).items()},
         "cleanrl": {key: said(gain) for key, gain in eight_packed(CLEANRL).items()},
         "over_brax": said_bounds(beside),

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.evaluation.figures import shown
+from benchmarks.evaluation.figures import NOT_MEASURED, shown
 from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
 from benchmarks.records import Call, calls_by_date
 
@@ -57,14 +57,14 @@ def seeds(calls: Calls) -> Rows:
 
 
 def _finished_on_playground() -> Calls:
-    """Of every task of Playground the newest call with a row whose seeds all ran."""
+    """Of Playground's tasks every call with a row whose seeds all ran, by task and date."""
     calls = [one for one in _calls(of_playground=True) if _finished(one[0])]
-    return {one[0].results["task"].removeprefix(PLAYGROUND): one for one in calls}
+    return {(one[0].results["task"].removeprefix(PLAYGROUND), one[0].date): one for one in calls}
 
 
 @table_of_calls(
     "playground-seeds",
-    "task | changed | successes: | return of every run: | without noise:",
+    "task | commit | changed | successes: | return of every run: | without noise:",
     _finished_on_playground,
 )
 def playground_seeds(calls: Calls) -> Rows:
@@ -72,13 +72,19 @@ def playground_seeds(calls: Calls) -> Rows:
 
     Returns are those of the latest episodes of training, and of the last evaluation.
     """
-    for task, (call, _) in calls.items():
+    for (task, _), (call, _) in calls.items():
         for row in _finished(call):
             of_training = [run["final_return"] for run in row["each"]]
             evaluated = [run["at_end"].get("eval/last") for run in row["each"]]
             successes = f"{row['successes']} of {row['seeds']}"
-            ends = (", ".join(shown(end, ".0f") for end in of) for of in (of_training, evaluated))
-            yield [task, _changed(row), successes, *ends]
+            cells = (call.commit or "", _changed(row), successes, _each(of_training))
+            yield [task, *cells, _each(evaluated)]
+
+
+def _each(returns: Sequence[float | None]) -> str:
+    if all(one is None for one in returns):
+        return NOT_MEASURED
+    return ", ".join(shown(one, ".0f") for one in returns)
 
 
 def _by_brax() -> Calls:

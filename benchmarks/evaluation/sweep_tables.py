@@ -69,23 +69,23 @@ def same_jobs() -> dict[str, list[SweepsOfCall]]:
     return found
 
 
-def eight_at_once(key: str) -> Figure | None:
-    """What eight of the first jobs gain at once, over one after another, by call."""
-    calls = next(iter(same_jobs().values()), [])
-    gains = [(gain, one.made_by) for one in calls if (gain := one.gain(EIGHT, ONE, key))]
-    return figure([gain for gain, _ in gains], *(made_by for _, made_by in gains))
+def eight_at_once(key: str) -> Ratio | None:
+    """What eight jobs gain in eight processes, over one after another."""
+    return _gain_of_one_call(ONE, key)
 
 
 def processes_over_program(key: str) -> Ratio | None:
-    """Eight jobs in eight processes, over the same jobs as one program.
+    """Eight jobs in eight processes, over the same jobs as one program."""
+    return _gain_of_one_call(PROGRAM, key)
 
-    Of one call: the one with the most sweeps, of those the newest.
-    """
+
+def _gain_of_one_call(base: str, key: str) -> Ratio | None:
+    """Of the call with the most sweeps of both, of those the newest."""
     found = [
         (gain.evidence.repeats, number, gain)
         for calls in same_jobs().values()
         for number, one in enumerate(calls)
-        if (gain := one.gain(EIGHT, PROGRAM, key))
+        if (gain := one.gain(EIGHT, base, key))
     ]
     return max(found, key=lambda one: one[:2])[2] if found else None
 
