@@ -3,7 +3,8 @@
 The same environments act with random actions in m GMIs (template `tcg`), and in m GMIs that
 simulate plus one that infers (`tdg`). With `--backends mps share` both run under both. With
 several `--envs` every number of GMIs runs with each. With `--gpus` cases run at the same time,
-each on a GPU of its own with its part of the cores. Adds a call to
+each on a GPU of its own with its part of the cores. A case that would not end in time, as long as
+the longest one before, is not started. Adds a call to
 `benchmarks/results/serving-<device>.json`; `simulator_s`, `agent_s` and `com_s` in it are medians
 of the stages of one dedicated step of all environments of a GMI.
 """
@@ -15,6 +16,7 @@ import itertools
 import statistics
 import sys
 import tempfile
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +25,7 @@ from benchmarks.evaluation.serving_tables import SERVING_HEAD, serving_row
 from benchmarks.evaluation.writer import markdown
 from benchmarks.free_gpus import Part, on_parts
 from benchmarks.records import results_file
-from benchmarks.runner import as_word, exit_code, failure_of, in_turn, options
+from benchmarks.runner import as_word, deadline, exit_code, failure_of, in_turn, options
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RunPaths, read_json
 
@@ -66,15 +68,20 @@ class Setting(NamedTuple):
 def main() -> int:
     """Measures what the command line asks for; returns 1 if a job failed, else 0."""
     given, machine = _options(), detect_machine()
-    file = results_file(given, "serving", gpus=1)
+    file, deadline_s = results_file(given, "serving", gpus=1), deadline(given.deadline_s)
+    took_s = [0.0]
 
     def run(setting: Setting, part: Part) -> None:
+        started_s = time.monotonic()
+        if started_s + max(took_s) >= deadline_s:
+            return
         case = measure(setting, given, part)
+        took_s.append(time.monotonic() - started_s)
         file.add("cases", case)
         print(*markdown(SERVING_HEAD, [serving_row(case)]), sep="\n", flush=True)
 
     on_parts(machine, given.gpus, settings_of(given), run)
-    return int(any("failed" in case for case in file.results["cases"]))
+    return int(any("failed" in case for case in file.results.get("cases", ())))
 
 
 def settings_of(given: argparse.Namespace) -> list[Setting]:
@@ -133,6 +140,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--unrolls", type=int, default=20, help="unrolls of every GMI")
     parser.add_argument("--gpus", type=int, default=1, help="for cases at the same time")
     parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
     return parser.parse_args()
 
 

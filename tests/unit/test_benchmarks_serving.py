@@ -2,12 +2,14 @@
 
 import argparse
 import json
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks import records
+from benchmarks import records, serving
 from benchmarks.evaluation import serving_tables
 from benchmarks.evaluation.serving_tables import peak_over_peak
 from benchmarks.evaluation.writer import TABLES
@@ -43,6 +45,25 @@ def test_every_number_of_environments_is_split_over_every_number_of_gmis():
     )
     found = {(one.simulators, one.num_envs) for one in settings_of(given)}
     assert found == {(1, 64), (2, 32), (1, 256), (2, 128)}
+
+
+def test_a_case_that_would_not_end_in_time_is_not_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    now_s = [0.0]
+
+    def lasting(setting: serving.Setting, *_: object) -> dict[str, Any]:
+        now_s[0] += 30.0
+        return case(setting.simulators, setting.num_envs, 10)
+
+    monkeypatch.setattr(serving, "measure", lasting)
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    words = ["serving", "--tasks", "ant", "--templates", "tcg", "--envs", "64", "256"]
+    monkeypatch.setattr(sys, "argv", [*words, "--deadline-s", "100", "--out", str(tmp_path)])
+    assert serving.main() == 0
+    (file,) = tmp_path.iterdir()
+    (call,) = records.read_calls(file)
+    assert len(call.results["cases"]) == 3
 
 
 def test_each_side_is_taken_at_its_own_best_number_of_environments(results: Path):
