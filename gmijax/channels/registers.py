@@ -148,7 +148,7 @@ class RemoteRegisters:
 
     Args:
       rank: of this process, for messages.
-      addresses: where it meets each of the others, `host:port` by rank.
+      addresses: of the connection with each of the others, `host:port` by rank.
       own_bytes: sizes of its registers.
       their_bytes: sizes of the registers of each of the others.
       listens: whether it listens at the addresses, or calls.

@@ -126,7 +126,7 @@ def _open(
 
 def _prepare(members: Sequence[_Member], plan: Plan, gmis: RunPaths) -> None:
     """Writes what the GMI reads when it starts; keeps the logs of the one before."""
-    keep_logs(gmis, len(list(gmis.root.glob("gmi_0/attempt_*"))))
+    keep_logs(gmis)
     write_json(gmis.plan, plan.to_dict())
     for config, run, _ in members:
         run.gmi(0).root.mkdir(exist_ok=True)

@@ -26,7 +26,7 @@ from gmijax.supervise.stop_signals import StopSignals, stop_signals
 from gmijax.supervise.watched_gmi import GmiStatus
 
 _LASTING = ("NonFiniteError", "ParameterMismatch", "SelfCheckFailed")
-"""Errors of a GMI that the next attempt would meet too."""
+"""Errors of a GMI that the next attempt would have too."""
 
 _DISK_IS_FULL = os.strerror(errno.ENOSPC)
 """In the message of whatever could not be written."""
@@ -159,7 +159,7 @@ class Attempts:
         add_event(self.run.events, "fault", attempt=number, **_about(error))
         self.say(f"{error}; starting again from {newest or 'the beginning'}")
         try:
-            keep_logs(self.run, number)
+            keep_logs(self.run)
             clear_unfinished(self.run, newest)
         except OSError as full:
             error.add_note(f"not started again: {full}")

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,12 +75,18 @@ def is_needless(config: TrainConfig, run: RunPaths) -> bool:
     return not (is_named or has_failed or has_trained(run))
 
 
-def keep_logs(run: RunPaths, attempt: int) -> None:
-    """Moves what the GMIs of a failed attempt have left out of the way of the next one's."""
-    for folder in gmi_folders(run.root):
-        kept = folder / f"attempt_{attempt}"
+def keep_logs(run: RunPaths) -> None:
+    """Moves what the GMIs of a failed attempt have left out of the way of the next one's.
+
+    They go to `attempt_<n>` with the first number that is free: an earlier command may have had
+    failed attempts in the same run folder.
+    """
+    gmis = gmi_folders(run.root)
+    number = next(n for n in count() if not any((gmi / f"attempt_{n}").exists() for gmi in gmis))
+    for folder in gmis:
+        kept = folder / f"attempt_{number}"
         files = [path for path in folder.iterdir() if path.is_file()]
-        kept.mkdir(exist_ok=True)
+        kept.mkdir()
         for path in files:
             path.rename(kept / path.name)
 

@@ -97,7 +97,7 @@ def test_a_restart_leaves_alone_what_is_not_its_own(run: RunPaths):
     assert not run.gmi(0).result.exists()
     assert (run.root / "gmi_0.bak" / "result.json").exists()
     run.gmi(0).stderr.touch()
-    keep_logs(run, 0)
+    keep_logs(run)
     assert attempt_folders(run.gmi(0).root) == [run.gmi(0).root / "attempt_0"]
     assert os.listdir(run.root / "gmi_0.bak") == ["result.json"]
 

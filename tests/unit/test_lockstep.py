@@ -26,7 +26,7 @@ class FakeWatch:
 
     def __init__(self) -> None:
         self.is_gone = threading.Event()
-        self.num_meetings = 0
+        self.num_barriers = 0
 
     def beat(self) -> None:
         pass
@@ -35,9 +35,9 @@ class FakeWatch:
         if self.is_gone.is_set():
             raise PeerLost(0, 2, operation, step)
 
-    def meet(self, *_: Any) -> None:
-        self.num_meetings += 1
-        self.is_gone.set()  # As at the end of a job, where each ends when all have met.
+    def barrier(self, *_: Any) -> None:
+        self.num_barriers += 1
+        self.is_gone.set()  # As at the end of a job, where each ends when all have arrived.
 
 
 @pytest.fixture
@@ -63,17 +63,17 @@ def test_a_leader_whose_own_device_is_through_sees_that_another_node_is_gone(gro
             released.set()
         with pytest.raises(PeerLost, match="GMI 0"):
             caught.result(20)
-    assert watch.num_meetings == 0
+    assert watch.num_barriers == 0
 
 
-def test_a_node_that_ends_after_the_meeting_is_not_lost(
+def test_a_node_that_ends_after_the_barrier_is_not_lost(
     groups, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     watch, ranks = groups
     # The other rank comes after the leader has had time to look.
-    monkeypatch.setattr(ranks[1], "meet_leaders", lambda: time.sleep(0.7))
+    monkeypatch.setattr(ranks[1], "leader_barrier", lambda: time.sleep(0.7))
     runners = [LockstepRunner(rank, SIZE) for rank in ranks]
     with ThreadPoolExecutor(2) as pool:
         steps = [pool.submit(runner.finish, lambda: True) for runner in runners]
         assert [step.result(20) for step in steps] == [True, True]
-    assert watch.num_meetings == 1
+    assert watch.num_barriers == 1

@@ -135,19 +135,19 @@ def test_a_leader_that_does_not_come_is_named_in_time(meshes: list[Mesh]) -> Non
 def test_leaders_meet_and_who_has_met_may_hang_up(watches: list[LeaderWatch]) -> None:
     def come_and_go(watch: LeaderWatch) -> None:
         for step in range(20):
-            watch.meet(10.0, "step", step, lambda: None)
+            watch.barrier(10.0, "step", step, lambda: None)
         watch.close()
 
     met = at_once(*(lambda watch=watch: come_and_go(watch) for watch in watches))
     assert met == [None] * 3
 
 
-def test_a_leader_that_hangs_up_before_the_meeting_is_lost(watches: list[LeaderWatch]) -> None:
+def test_a_leader_that_hangs_up_before_the_barrier_is_lost(watches: list[LeaderWatch]) -> None:
     watches[0].look(running_s(), 10.0, "step", 7)
     watches[1].close()
     lost = r"GMI 0: GMI 10 is gone during step of several nodes, step 7"
     with pytest.raises(PeerLost, match=lost):
-        watches[0].meet(10.0, "step", 7, lambda: None)
+        watches[0].barrier(10.0, "step", 7, lambda: None)
     with pytest.raises(PeerLost, match=lost):
         watches[0].look(running_s(), 10.0, "step", 7)
 
@@ -163,7 +163,7 @@ def test_time_counts_only_while_a_leader_is_silent(watches: list[LeaderWatch]) -
     with pytest.raises(
         CollectiveTimeout, match=r"waited 0\.5 s in step .*for GMIs \[10\]"
     ) as late:
-        mine.meet(0.5, "step", 3, lambda: waited.append(1))
+        mine.barrier(0.5, "step", 3, lambda: waited.append(1))
     assert late.value.missing == (10,)
     assert waited
     # It may come to the first wait of a long time late, and not be blamed for what was before.

@@ -184,12 +184,22 @@ def test_a_failure_while_the_job_stops_is_not_tried_again(job: Job):
 
 def test_logs_of_a_failed_attempt_are_kept(run: RunPaths):
     write_json(run.gmi(0).error, {"type": "E"})
-    keep_logs(run, 0)
+    keep_logs(run)
     write_json(run.gmi(0).error, {"type": "F"})
-    keep_logs(run, 1)
+    keep_logs(run)
     kept = [read_json(run.gmi(0).root / f"attempt_{n}" / "error.json")["type"] for n in (0, 1)]
     assert kept == ["E", "F"]
     assert not run.gmi(0).error.exists()
+
+
+def test_logs_of_an_earlier_command_are_kept(job: Job):
+    gmi = job.run.gmi(0).root
+    (gmi / "attempt_0").mkdir(parents=True)
+    write_json(gmi / "attempt_0" / "error.json", {"type": "E"})
+    write_json(job.run.gmi(0).error, {"type": "F"})
+    job.go(job.dies(100), fine)
+    kept = [read_json(gmi / f"attempt_{n}" / "error.json")["type"] for n in (0, 1)]
+    assert kept == ["E", "F"]
 
 
 def test_what_came_after_the_checkpoint_is_dropped(run: RunPaths):

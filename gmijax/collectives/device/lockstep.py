@@ -1,7 +1,7 @@
-"""Runs a step on the devices of all ranks: they meet before and after, and watch their peers.
+"""Runs a step on the devices of all ranks, between two barriers, and watches the peers meanwhile.
 
-On several nodes the ranks of each meet before, and all of them after a step; meanwhile the leaders
-watch each other, because a device that waits for another node in a ring tells nobody.
+On several nodes the barrier before a step is of the ranks of each, that after it of all; meanwhile
+the leaders watch each other: a device that waits for another node in a ring reports nothing.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ class LockstepRunner:
         with barrier.raise_peer_failure():
             result = self._thread.run(program, barrier.watch)
         # Some have given it to their devices a step before others. Those may be in a ring with
-        # another node; not so after the meeting, when that node may have ended as it should.
+        # another node; not so after the barrier, when that node may have ended as it should.
         barrier.wait(while_unresponsive=True, looks_at_nodes=True)
         if isinstance(self._group, MultiNodeGroup):
-            self._group.meet_leaders()
+            self._group.leader_barrier()
             barrier.wait(while_unresponsive=True)
         barrier.end()
         return result

@@ -34,7 +34,7 @@ from gmijax.collectives.shared_memory import (
 MAX_GATHER_FLOATS = 16384  # 64 KiB a rank
 FLOATS_PER_LINE = 16
 LANES = 2
-"""Ranks meet in each of them by itself: from outside of programs, and from within."""
+"""Each has barriers of its own: from outside of programs, and from within."""
 
 LINE = np.dtype(
     [

@@ -16,12 +16,12 @@ from gmijax.collectives.waits import wait_until
 from gmijax.errors import CollectiveTimeout, PeerLost
 
 _WAITS: Final = b"."
-_IS_THROUGH: Final = b"!"
+_HAS_ARRIVED: Final = b"!"
 _READ_BYTES: Final = 4096
 
 
 class LeaderWatch:
-    """One leader's view of the others; they make the same calls of `meet`.
+    """One leader's view of the others; they make the same calls of `barrier`.
 
     Args:
       sockets: with the other nodes; not blocking.
@@ -32,24 +32,24 @@ class LeaderWatch:
     def __init__(self, sockets: Sockets, node: int, ids: Sequence[int]) -> None:
         self._sockets, self._node, self._ids = sockets, node, ids
         self._heard_s = dict.fromkeys(sockets, running_s())
-        self._met = dict.fromkeys(sockets, 0)
-        self._num_meetings = 0
+        self._arrivals = dict.fromkeys(sockets, 0)
+        self._num_barriers = 0
         self._gone: set[int] = set()
 
     def beat(self) -> None:
-        """Tells the others that this node waits, and hears what they tell."""
+        """Sends to the others that this node waits, and reads what they have sent."""
         self._send(_WAITS)
-        self._hear()
+        self._receive()
 
     def look(self, since_s: float, timeout_s: float, operation: str, step: int) -> None:
         """`beat`, and an error if another node is gone, or silent since `since_s` for too long.
 
         Raises:
-          PeerLost: a leader has hung up before it came to the next meeting.
+          PeerLost: a leader has hung up before it came to the next barrier.
           CollectiveTimeout: nothing was heard of a node for `timeout_s`.
         """
         self.beat()
-        late = [node for node in self._sockets if self._met[node] <= self._num_meetings]
+        late = [node for node in self._sockets if self._arrivals[node] <= self._num_barriers]
         own = self._ids[self._node]
         if gone := [node for node in late if node in self._gone]:
             raise PeerLost(own, self._ids[gone[0]], f"{operation} of several nodes", step)
@@ -58,10 +58,10 @@ class LeaderWatch:
             missing = tuple(self._ids[node] for node in silent)
             raise CollectiveTimeout(own, missing, f"{operation} of several nodes", step, timeout_s)
 
-    def meet(
+    def barrier(
         self, timeout_s: float, operation: str, step: int, on_wait: Callable[[], None]
     ) -> None:
-        """Waits for the other leaders to come here; time only counts while one is silent.
+        """Waits for the other leaders; time only counts while one is silent.
 
         Args:
           timeout_s: longest silence.
@@ -72,41 +72,41 @@ class LeaderWatch:
         Raises:
           PeerLost, CollectiveTimeout: see `look`.
         """
-        self._send(_IS_THROUGH)
+        self._send(_HAS_ARRIVED)
         since_s = running_s()
 
-        def all_met() -> bool | None:
-            self._hear()
-            return min(self._met.values()) > self._num_meetings or None
+        def have_arrived() -> bool | None:
+            self._receive()
+            return min(self._arrivals.values()) > self._num_barriers or None
 
         def check() -> None:
             on_wait()
             self.look(since_s, timeout_s, operation, step)
 
-        wait_until(all_met, check, float("inf"))
-        self._num_meetings += 1
+        wait_until(have_arrived, check, float("inf"))
+        self._num_barriers += 1
 
     def close(self) -> None:
         """Hangs up."""
         for connection in self._sockets.values():
             connection.close()
 
-    def _send(self, told: bytes) -> None:
+    def _send(self, data: bytes) -> None:
         for connection in self._sockets.values():
             # It is gone, which is for `look` to say, or has not read what was sent for hours.
             with suppress(OSError):
-                connection.send(told)
+                connection.send(data)
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         for node, connection in self._sockets.items():
             try:
-                told = connection.recv(_READ_BYTES)
+                data = connection.recv(_READ_BYTES)
             except BlockingIOError:
                 continue
             except OSError:
-                told = b""
-            if told:
+                data = b""
+            if data:
                 self._heard_s[node] = running_s()
-                self._met[node] += told.count(_IS_THROUGH)
+                self._arrivals[node] += data.count(_HAS_ARRIVED)
             else:
                 self._gone.add(node)

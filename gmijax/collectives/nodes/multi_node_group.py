@@ -91,7 +91,7 @@ class MultiNodeGroup:
             self._mesh.restart()
         return gathered
 
-    def meet_leaders(self) -> None:
+    def leader_barrier(self) -> None:
         """Waits for the leaders of all nodes in the call of `local` that is open.
 
         Raises:
@@ -99,7 +99,7 @@ class MultiNodeGroup:
         """
         if self._watch is not None:
             barrier = self.local.barrier
-            self._watch.meet(barrier.limit_s, "step", barrier.step, self.local.heartbeat)
+            self._watch.barrier(barrier.limit_s, "step", barrier.step, self.local.heartbeat)
 
     def close(self) -> None:
         """Gives the memory back and hangs up. Idempotent."""
