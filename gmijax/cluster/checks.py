@@ -28,9 +28,9 @@ _POLL_S = 0.2
 def by_name(joined: Sequence[NodeHandle]) -> dict[str, NodeHandle]:
     """Nodes by address, in order; those after the first of a machine have their place added."""
     named: dict[str, NodeHandle] = {}
-    for place, node in enumerate(joined):
+    for number, node in enumerate(joined):
         address = node.remote.address
-        named[f"{address}#{place}" if address in named else address] = node
+        named[f"{address}#{number}" if address in named else address] = node
     return named
 
 

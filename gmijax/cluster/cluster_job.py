@@ -97,8 +97,8 @@ class ClusterJob:
         for one in opened:
             calls |= one.calls
         token = secrets.token_bytes(32)
-        for place, (node, _) in enumerate(self._joined):
-            node.call("set_addresses", NodeAddresses(place, addresses, token, calls))
+        for number, (node, _) in enumerate(self._joined):
+            node.call("set_addresses", NodeAddresses(number, addresses, token, calls))
         first = [gmis[0] for gmis in launch.plan.layout.gmis_of_node]
         for gmi, (node, _) in zip(first, self._joined, strict=True):
             if node.lost is not None:
@@ -119,8 +119,8 @@ class ClusterJob:
         sent = dataclasses.replace(launch, on_warning=print, is_enough=None)
         daemons: dict[str, Path] = {}
         found: list[NodeEndpoints] = []
-        for place, (node, facts) in enumerate(self._joined):
-            opened = node.call("open", sent, place, facts.address, daemons)
+        for number, (node, facts) in enumerate(self._joined):
+            opened = node.call("open", sent, number, facts.address, daemons)
             if isinstance(opened, BackendUnavailable):
                 raise BackendUnavailable(f"node {node.address}: {opened}")
             found.append(opened or NodeEndpoints(("", 0), {}, {}))  # None of a node that is gone.

@@ -33,13 +33,13 @@ from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
 from gmijax.types import Array, PRNGKey
 
 
-def envs_of(config: TrainConfig | ServeConfig, place: int) -> Env:
-    """The environments of the GMI that is number `place` of those that simulate."""
+def envs_of(config: TrainConfig | ServeConfig, rank: int) -> Env:
+    """The environments of the GMI that is number `rank` of those that simulate."""
     return make_envs(
         config.env,
         config.physics.impl,
         seed=config.seed,
-        first_env=place * config.envs_per_gmi,
+        first_env=rank * config.envs_per_gmi,
         num_envs=config.envs_per_gmi,
     )
 
@@ -101,7 +101,7 @@ def _keys(seed: int) -> tuple[PRNGKey, PRNGKey]:
 def first_envs(
     env: BatchedEnv,
     config: TrainConfig,
-    place: int,
+    rank: int,
     *,
     gmi: int | None = None,
     num_gmis: int | None = None,
@@ -115,7 +115,7 @@ def first_envs(
     Args:
       env: the environments.
       config: of the run.
-      place: number of this GMI among those that simulate.
+      rank: number of this GMI among those that simulate.
       gmi: whose environments of a checkpoint to take, None for nobody's.
       num_gmis: only from a checkpoint of so many GMIs, None for any.
       num_runs: that share the GMI; all of them have to fit.
@@ -131,7 +131,7 @@ def first_envs(
         key = jax.random.fold_in(key, meta.env_steps % 2**31)
     algo = config.algo
     env_state = begin_episodes(
-        *(env, key, place * num_envs, num_envs),
+        *(env, key, rank * num_envs, num_envs),
         kept_steps=algo.kept_steps,
         kept_itemsize=algo.kept_itemsize,
         kept_key=algo.kept_key,

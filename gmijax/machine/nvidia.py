@@ -141,18 +141,18 @@ def _describe(index: int) -> Gpu:
 
 def _instances(handle: Any) -> tuple[MigInstance, ...]:
     found: list[MigInstance] = []
-    places = 0
+    most = 0
     with suppress(pynvml.NVMLError):
-        places = pynvml.nvmlDeviceGetMaxMigDeviceCount(handle)
-    for place in range(places):
+        most = pynvml.nvmlDeviceGetMaxMigDeviceCount(handle)
+    for index in range(most):
         # Holes are normal: instances keep their places when others go.
         with suppress(pynvml.NVMLError):
-            found.append(_describe_instance(handle, place))
+            found.append(_describe_instance(handle, index))
     return tuple(found)
 
 
-def _describe_instance(handle: Any, place: int) -> MigInstance:
-    instance = pynvml.nvmlDeviceGetMigDeviceHandleByIndex(handle, place)
+def _describe_instance(handle: Any, index: int) -> MigInstance:
+    instance = pynvml.nvmlDeviceGetMigDeviceHandleByIndex(handle, index)
     name = str(pynvml.nvmlDeviceGetName(instance))
     return MigInstance(
         uuid=str(pynvml.nvmlDeviceGetUUID(instance)),

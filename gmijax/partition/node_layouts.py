@@ -49,8 +49,8 @@ def node_layouts(
     if nodes is None:
         return (NodeLayout(None, machine, layout, tuple(layout.gmis)),)
     return tuple(
-        NodeLayout(name, theirs, layout.of_node(place), layout.gmis_of_node[place])
-        for place, (name, theirs) in enumerate(nodes.items())
+        NodeLayout(name, theirs, layout.of_node(node), layout.gmis_of_node[node])
+        for node, (name, theirs) in enumerate(nodes.items())
     )
 
 

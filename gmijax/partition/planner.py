@@ -118,9 +118,9 @@ def _allocations(
     allocations: dict[int, Allocation] = {}
     chosen: list[Gpu] = []
     num_gpus = 0
-    for place, node in enumerate(of_nodes):
+    for number, node in enumerate(of_nodes):
         here, gpus = node.layout, ()
-        said = [] if place else reasons  # What is said of all is said once.
+        said = [] if number else reasons  # What is said of all is said once.
         with node.named():
             if node.name is not None:
                 what = f"cluster.nodes={len(of_nodes)}"

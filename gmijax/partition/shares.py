@@ -92,7 +92,7 @@ def assign_instances(num_sms: Sequence[int], num_gmis: int) -> tuple[int, ...]:
     for _ in range(num_gmis):
         best = max(
             range(len(num_sms)),
-            key=lambda place: (load[place] == 0, num_sms[place] / (load[place] + 1), -place),
+            key=lambda gpu: (load[gpu] == 0, num_sms[gpu] / (load[gpu] + 1), -gpu),
         )
         load[best] += 1
         chosen.append(best)

@@ -69,12 +69,12 @@ class GroupReducer:
         skeleton, arrays = flatten(tree, scalars=True)
         reduced: dict[int, npt.NDArray[Any]] = {}
         for dtype in dict.fromkeys(array.dtype for array in arrays):
-            places = [place for place, array in enumerate(arrays) if array.dtype == dtype]
-            flat = np.concatenate([arrays[place].reshape(-1) for place in places])
+            indices = [index for index, array in enumerate(arrays) if array.dtype == dtype]
+            flat = np.concatenate([arrays[index].reshape(-1) for index in indices])
             result = self._reduce_flat(group, flat, op)
-            ends = np.cumsum([arrays[place].size for place in places])[:-1]
-            reduced.update(zip(places, np.split(result, ends), strict=True))
-        return unflatten(skeleton, [as_bytes(reduced[place]) for place in range(len(arrays))])
+            ends = np.cumsum([arrays[index].size for index in indices])[:-1]
+            reduced.update(zip(indices, np.split(result, ends), strict=True))
+        return unflatten(skeleton, [as_bytes(reduced[index]) for index in range(len(arrays))])
 
     def close(self) -> None:
         """Closes the reducer, if one was made."""

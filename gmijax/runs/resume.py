@@ -97,8 +97,8 @@ def _meant(wanted: str, key: str) -> str:
         return f"; did you mean {RUNS / folder}?"
     is_name = folder.parent == Path()
     try:
-        places = [folder.parent, *([RUNS] if is_name else [])]
-        near = {path.name: str(path) for place in places for path in _folders_in(place)}
+        folders = [folder.parent, *([RUNS] if is_name else [])]
+        near = {path.name: str(path) for parent in folders for path in _folders_in(parent)}
     except (OSError, ValueError):  # Not to be read, or no name that a folder can have.
         near = {}
     if is_name:

@@ -40,11 +40,11 @@ def plain(mj_model: Model) -> Model:
     for k in resisting:
         gear = same.actuator_gear[same.actuator_outadr[k], 0]
         of = "dof" if targets[k] < same.nv else "tendon"
-        place = targets[k] - (0 if of == "dof" else same.nv)
+        index = targets[k] - (0 if of == "dof" else same.nv)
         for kind in ("damping", "dampingpoly", "armature"):
             own = getattr(same, f"actuator_{kind}")
             if targets[k] >= 0:  # MuJoCo has none of balls and free bodies.
-                getattr(same, f"{of}_{kind}")[place] += own[k] * gear**2
+                getattr(same, f"{of}_{kind}")[index] += own[k] * gear**2
             own[k] = 0.0
     return same
 

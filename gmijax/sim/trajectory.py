@@ -68,8 +68,8 @@ def chosen(
     at = (np.arange(count) + 0.5) / count * len(order)
     indices = order[at.astype(int)]
     labels = [
-        f"return {rounded(float(returns[index]))} (rank {len(order) - int(place)} of {len(order)})"
-        for place, index in zip(at, indices, strict=True)
+        f"return {rounded(float(returns[index]))} (rank {len(order) - int(nth)} of {len(order)})"
+        for nth, index in zip(at, indices, strict=True)
     ]
     median = f"median return {rounded(float(np.median(returns)))} of {len(order)} episodes"
     longest = int(lengths[indices].max())

@@ -51,18 +51,18 @@ def _run(link: ChildLink) -> dict[str, Any] | None:
     check_share(plan, link.gmi)
     simulating, _ = groups_of(plan)
     # A trainer that steps no environment takes the sizes from those of the first GMI that does.
-    place = simulating.gmis.index(link.gmi) if link.gmi in simulating.gmis else 0
-    env = environments(config, place)
+    rank = simulating.gmis.index(link.gmi) if link.gmi in simulating.gmis else 0
+    env = environments(config, rank)
     with ExitStack() as held:
         if config.is_decoupled:
-            return _run_asynchronous(config, plan, place, env, link, held)
-        return _run_synchronous(config, plan, place, env, link, held)
+            return _run_asynchronous(config, plan, rank, env, link, held)
+        return _run_synchronous(config, plan, rank, env, link, held)
 
 
 def _run_synchronous(
     config: TrainConfig,
     plan: Plan,
-    place: int,
+    rank: int,
     env: BatchedEnv,
     link: ChildLink,
     held: ExitStack,
@@ -74,7 +74,7 @@ def _run_synchronous(
     trainers = groups_of(plan)[1]
     is_apart = plan.template == "tdg_ex"
     if is_apart and link.gmi not in trainers.gmis:
-        return _serve_rollouts(config, plan, place, env, link, held)
+        return _serve_rollouts(config, plan, rank, env, link, held)
     algorithm = load_algorithm(config.algo)
     learner = algorithm.make_learner(env.spec, config.algo)
     num_averaged = algorithm.num_averaged(env.spec, config.algo)
@@ -119,7 +119,7 @@ def _remote_iteration(
 def _serve_rollouts(
     config: TrainConfig,
     plan: Plan,
-    place: int,
+    rank: int,
     env: BatchedEnv,
     link: ChildLink,
     held: ExitStack,
@@ -139,7 +139,7 @@ def _serve_rollouts(
     # The first weights come when the trainer is there, which may still start.
     mail = Messenger(block, max(config.reduce.timeout_s, config.run.start_timeout_s))
     learner = make_learner(env.spec, config.algo)
-    state = first_envs(env, config, place)
+    state = first_envs(env, config, rank)
     rollouts = serve_rollouts(env, learner, state, mail, trainer, link.beat)
     mail.flush()
     return {"status": "completed", "rollouts": rollouts}
@@ -148,7 +148,7 @@ def _serve_rollouts(
 def _run_asynchronous(
     config: TrainConfig,
     plan: Plan,
-    place: int,
+    rank: int,
     env: BatchedEnv,
     link: ChildLink,
     held: ExitStack,
@@ -177,7 +177,7 @@ def _run_asynchronous(
             listener.close()  # It is for trainers.
         sender = open_sender(*channels)
         held.callback(sender.close)
-        return Agent(config, env, place, trainers.gmis, registers, sender, link).run()
+        return Agent(config, env, rank, trainers.gmis, registers, sender, link).run()
     receiver = open_receiver(*channels)
     held.callback(receiver.close)
     num_averaged = exchange_size(env.spec, config.algo, A3cLosses)
@@ -202,13 +202,13 @@ def _topology(plan: Plan, trainers: Group, nodes: NodeAddresses | None) -> Chann
     return replace(topology, addresses=addresses, secret=nodes.token)
 
 
-def environments(config: TrainConfig, place: int) -> BatchedEnv:
-    """The environments of the GMI that is number `place` of those that simulate."""
+def environments(config: TrainConfig, rank: int) -> BatchedEnv:
+    """The environments of the GMI that is number `rank` of those that simulate."""
     from gmijax.learning.start import envs_of
     from gmijax.sim.wrappers import training_env
 
     random_ep_len = config.algo.init_at_random_ep_len
-    return training_env(envs_of(config, place), random_ep_len=random_ep_len)
+    return training_env(envs_of(config, rank), random_ep_len=random_ep_len)
 
 
 def _trainers_communicator(

@@ -106,10 +106,10 @@ def attempt(what: str, function: Callable[..., Any], *arguments: Any, **named: A
         lines = str(error).strip().splitlines() or [""]
         found = f"; {_FOUND}" if isinstance(error, ModuleNotFoundError) else ""
         said = with_type(type(error).__name__, lines[0])
-        raise ConfigError(f"{what} fails: {said}{_place(error)}{found}") from error
+        raise ConfigError(f"{what} fails: {said}{_line_of(error)}{found}") from error
 
 
-def _place(error: BaseException) -> str:
+def _line_of(error: BaseException) -> str:
     if isinstance(error, SyntaxError):
         return ""  # Its message has the line.
     ours = str(Path(__file__).parents[2])
