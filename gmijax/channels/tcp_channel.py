@@ -48,7 +48,7 @@ class _End:
         self._sequence = 0
         self._has_left = False
 
-    def _tell(self, kind: int, sequence: int) -> None:
+    def _send_notice(self, kind: int, sequence: int) -> None:
         """Sends a message without parts, if there is somebody who could want it."""
         self._connection.send([HEADER.pack(kind, sequence)])
 
@@ -143,7 +143,7 @@ class RemoteWriter(_End):
         """See `PipeWriter`."""
         if self._connection.is_closed:
             return
-        self._tell(GOODBYE, self._sequence)
+        self._send_notice(GOODBYE, self._sequence)
         # An answer to a socket that is closed resets the connection, and what the network has
         # not delivered by then is lost. A trainer that starts more slowly may still come.
         left = deadline_s = math.inf
@@ -199,7 +199,7 @@ class RemoteReader(_End):
         """See `PipeReader`."""
         if self._is_held:
             self._is_held = False
-            self._tell(RELEASED, self._sequence)
+            self._send_notice(RELEASED, self._sequence)
 
     def why_lost(self, operation: str, step: int) -> GmijaxError | None:
         """See `PipeReader`."""
@@ -208,5 +208,5 @@ class RemoteReader(_End):
     def close(self) -> None:
         """See `PipeReader`."""
         if not self._connection.is_closed:
-            self._tell(GOODBYE, 0)
+            self._send_notice(GOODBYE, 0)
             self._connection.close()

@@ -150,7 +150,7 @@ class BackendOfNodes(Backend):
 
     def terminate(self, gmi: int, pids: Collection[int]) -> None:
         """See `Backend`."""
-        self._nodes[self.plan.layout.node_of(gmi)].tell("terminate", gmi, pids)
+        self._nodes[self.plan.layout.node_of(gmi)].send("terminate", gmi, pids)
 
 
 def _cpus_of_a_node(config: TrainConfig) -> int:

@@ -17,7 +17,7 @@ SILENT_S: Final = 0.5
 """Without an answer for longer, a node may be gone."""
 
 LOST_S: Final = 60.0
-"""Without an answer for longer it is; Ray tells most deaths sooner."""
+"""Without an answer for longer it is; Ray reports most deaths sooner."""
 
 
 class Answer(Protocol):
@@ -73,18 +73,18 @@ class RemoteNode:
         """What a method returns or raises; None if the node is gone, or while it is being lost."""
         return None if self.lost is not None else self._answer(self._ask(method, *arguments))
 
-    def tell(self, method: str, *arguments: Any) -> None:
+    def send(self, method: str, *arguments: Any) -> None:
         """Calls a method without waiting for it; a node does one after the other."""
         if self.lost is None:
-            with suppress(Exception):  # The next poll tells.
+            with suppress(Exception):  # The next poll finds out.
                 self._ask(method, *arguments)
 
     def order(self, child: int, order: str) -> None:
         """Has it do something with a GMI or another child, without waiting for that."""
-        self.tell("order", child, order)
+        self.send("order", child, order)
 
     def look(self, child: int) -> Any:
-        """The newest that its `poll` told of a child; None before the first answer."""
+        """The newest that its `poll` reported of a child; None before the first answer."""
         now_s = running_s()
         if self.lost is None and self._asked is not None and self._asked.is_there():
             seen, self._asked = self._answer(self._asked), None

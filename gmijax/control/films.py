@@ -75,7 +75,7 @@ def filmed(gl: str | None, run: RunPaths, say: Callable[[str], None]) -> Iterato
         is_well = True
     finally:
         if is_well:
-            process.tell(FINISH)
+            process.send(FINISH)
             if _waiting(run):
                 say("filming the last evaluation")
         if not process.end(LAST_FILM_TIMEOUT_S if is_well else _GIVE_UP_S):

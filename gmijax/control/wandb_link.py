@@ -59,7 +59,7 @@ def followed(
         lost="nothing more is sent",
         say=say,
     )
-    process.tell(json.dumps(to_dict(config)).encode())
+    process.send(json.dumps(to_dict(config)).encode())
     try:
         yield
     finally:

@@ -71,7 +71,7 @@ class JanitorLink:
 
     def watch_daemon(self, control: MpsControl) -> None:
         """Makes the janitor quit this daemon and remove its pipe directory; tell it before."""
-        self._tell({"daemon": str(control.pipe_directory), "program": str(control.program)})
+        self._send({"daemon": str(control.pipe_directory), "program": str(control.program)})
 
     def watch_gmi(self, pid: int, group: int | None = None) -> None:
         """Makes the janitor wait for the process group of this process, and kill it if it stays.
@@ -81,11 +81,11 @@ class JanitorLink:
           group: its number; None: that of the process.
         """
         if process := identify(pid):
-            self._tell({"gmi": list(process), "group": group or pid})
+            self._send({"gmi": list(process), "group": group or pid})
 
     def dismiss(self) -> None:
         """Says that everything is clean and waits for the janitor to end."""
-        self._tell({"clean": True})
+        self._send({"clean": True})
         self._pipe.close()
         if not has_ended(self._process, _DAEMON_ENDS_S):
             self._process.kill()
@@ -99,7 +99,7 @@ class JanitorLink:
         self._pipe.close()
         self._process.wait()
 
-    def _tell(self, message: dict[str, Any]) -> None:
+    def _send(self, message: dict[str, Any]) -> None:
         # A janitor that somebody killed must not end the job that it only guards.
         self._pipe.write(json.dumps(message).encode() + b"\n")
 

@@ -67,7 +67,7 @@ class SideProcess:
         finally:
             os.close(self._pipe.read_end)
 
-    def tell(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         """Sends bytes to its standard input."""
         self._pipe.write(data)
 

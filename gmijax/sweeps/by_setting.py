@@ -66,7 +66,7 @@ def settings_of(rows: Sequence[Row], ranking: Ranking) -> list[dict[str, Any]]:
     """
     found = [_setting(own) for own in grouped(rows, lambda row: row["overrides"]).values()]
     return sorted(
-        found, key=lambda setting: place_of(setting, setting["interquartile_mean"], ranking)
+        found, key=lambda setting: sort_key(setting, setting["interquartile_mean"], ranking)
     )
 
 
@@ -83,7 +83,7 @@ def _setting(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def place_of(row: Row, value: float | None, ranking: Ranking) -> tuple[bool, bool, float]:
+def sort_key(row: Row, value: float | None, ranking: Ranking) -> tuple[bool, bool, float]:
     """What rows are sorted by: the best one has the smallest."""
     sign = -1.0 if ranking.direction == "maximize" else 1.0
     return value is None, not row["window_full"], sign * (value or 0.0)

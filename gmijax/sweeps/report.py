@@ -26,9 +26,9 @@ from gmijax.sweeps.by_setting import (
     SeedSummary,
     grouped,
     name_of_middle,
-    place_of,
     seed_summary,
     settings_of,
+    sort_key,
 )
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.progress import State
@@ -165,7 +165,7 @@ def _flat(setting: Row) -> Row:
 def ranked(rows: Sequence[Row], ranking: Ranking) -> list[Row]:
     """Rows that have a value, the best first; those without a full window come last."""
     found = [row for row in rows if row["value"] is not None]
-    return sorted(found, key=lambda row: place_of(row, row["value"], ranking))
+    return sorted(found, key=lambda row: sort_key(row, row["value"], ranking))
 
 
 def tables(report: Mapping[str, Any], ranking: Ranking) -> list[Table]:
@@ -245,7 +245,7 @@ def draw_curves(jobs: Sequence[AnyJob], ranking: Ranking, paths: SweepPaths) -> 
 
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.add_subplot()
-    for label, own in zip(told_apart(list(drawn)), drawn.values(), strict=True):
+    for label, own in zip(distinguishing_labels(list(drawn)), drawn.values(), strict=True):
         steps, middle = spread([job.progress.curve for job in own])
         axes.plot(steps, middle.mean, label=f"{label} (n={len(own)})")
         if len(own) > 1:
@@ -258,7 +258,7 @@ def draw_curves(jobs: Sequence[AnyJob], ranking: Ranking, paths: SweepPaths) -> 
     write_bytes(paths.curves, drawn_png.getvalue())
 
 
-def told_apart(labels: Sequence[str]) -> list[str]:
+def distinguishing_labels(labels: Sequence[str]) -> list[str]:
     """Labels for a legend: without the words that all have, in two lines at most."""
     words = [label.split() for label in labels]
     shared = set.intersection(*map(set, words)) if len(labels) > 1 else set[str]()

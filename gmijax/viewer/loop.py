@@ -223,7 +223,7 @@ class Loop:
             case requests.Drag():
                 self._simulation.drag(request)
             case requests.SetCommand(command):
-                self._simulation.tell(command)
+                self._simulation.set_command(command)
 
     def _pause(self, paused: bool) -> None:
         self._change(paused=paused)

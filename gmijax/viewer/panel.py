@@ -126,7 +126,7 @@ class Panel:
                 if limit > 0.0
             ]
 
-        async def tell(_: Any) -> None:
+        async def send_command(_: Any) -> None:
             values = iter(sliders)
             told = tuple(next(values).value if limit > 0.0 else 0.0 for limit in limits.values())
             self._put(requests.SetCommand(None if drawn.value else told))
@@ -134,9 +134,9 @@ class Panel:
         async def take(event: Any) -> None:
             if event.client is not None:  # Moved by somebody, not by us.
                 drawn.value = False
-                await tell(event)
+                await send_command(event)
 
-        drawn.on_update(tell)
+        drawn.on_update(send_command)
         for slider in sliders:
             slider.on_update(take)
 

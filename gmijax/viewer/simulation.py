@@ -50,7 +50,7 @@ class Simulation:
     def __init__(self, envs: Sequence[PlainEnv], policy: Policy, seed: int) -> None:
         self.envs, self.policy = envs, policy
         self.episodes = [self._first(1, None) for _ in envs]
-        self._told: Floats | None = None
+        self._command: Floats | None = None
         self._pulls: dict[int, Pull] = {}
         self._torn_off: set[int] = set()
         self._pushes: dict[int, Floats] = {}
@@ -117,11 +117,11 @@ class Simulation:
             self._pulls[drag.env] = pull
         pull.pointer = drag.pointer
 
-    def tell(self, command: Sequence[float] | None) -> None:
-        """Tells all robots what to do; None: what the task draws, from the next episode on."""
-        self._told = None if command is None else np.array(command, np.float32)
+    def set_command(self, command: Sequence[float] | None) -> None:
+        """Commands all robots; None: what the task draws, from the next episode on."""
+        self._command = None if command is None else np.array(command, np.float32)
         for env in self.envs:
-            self._tell(env)
+            self._apply_command(env)
 
     def pushed_lately(self) -> dict[int, Floats]:
         """Changes of velocity [3] by pushes of the last half of a second, m/s, by environment."""
@@ -144,7 +144,7 @@ class Simulation:
         self.envs[number].reset()
         ended = sum(before.sums.values()) if before.steps else before.last_return
         self.episodes[number] = self._first(before.number + bool(before.steps), ended)
-        self._tell(self.envs[number])
+        self._apply_command(self.envs[number])
 
     def _first(self, number: int, last_return: float | None) -> Episode:
         names = self.envs[0].spec.reward_terms
@@ -157,9 +157,9 @@ class Simulation:
         sums = {name: before.sums[name] + value for name, value in terms.items()}
         self.episodes[number] = before._replace(steps=before.steps + 1, sums=sums, now=terms)
 
-    def _tell(self, env: PlainEnv) -> None:
-        if self._told is not None:
-            env.command = self._told
+    def _apply_command(self, env: PlainEnv) -> None:
+        if self._command is not None:
+            env.command = self._command
 
 
 def pushed_body(model: Any) -> int:

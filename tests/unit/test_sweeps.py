@@ -40,7 +40,7 @@ from gmijax.sweeps.packs import most_together, require_packable
 from gmijax.sweeps.paths import ENV_PACK_DIR, SweepPaths
 from gmijax.sweeps.profile_jobs import profiled_job
 from gmijax.sweeps.progress import Progress
-from gmijax.sweeps.report import JobsReport, draw_curves, spread, tables, told_apart
+from gmijax.sweeps.report import JobsReport, distinguishing_labels, draw_curves, spread, tables
 from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
 from gmijax.sweeps.words import announce
 
@@ -433,10 +433,13 @@ def test_what_has_no_window_is_averaged_over_the_last_tenth() -> None:
 
 def test_a_legend_has_what_tells_settings_apart() -> None:
     command = "command=python -m train --env go1 --lr {} --seed {}"
-    assert told_apart([command.format(0.1, 0), command.format(0.3, 0)]) == ["0.1", "0.3"]
-    assert told_apart(["lr=1 seed=0"]) == ["lr=1 seed=0"]
-    assert told_apart(["lr=1", "lr=1 wd=2"]) == ["lr=1", "wd=2"]
-    long = told_apart([40 * "a=1 "])[0].splitlines()
+    assert distinguishing_labels([command.format(0.1, 0), command.format(0.3, 0)]) == [
+        "0.1",
+        "0.3",
+    ]
+    assert distinguishing_labels(["lr=1 seed=0"]) == ["lr=1 seed=0"]
+    assert distinguishing_labels(["lr=1", "lr=1 wd=2"]) == ["lr=1", "wd=2"]
+    long = distinguishing_labels([40 * "a=1 "])[0].splitlines()
     assert len(long) == 2
     assert max(map(len, long)) <= 70
 
