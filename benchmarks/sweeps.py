@@ -3,7 +3,7 @@
 The same runs as sweeps with one at a time, several under MPS, several under plain sharing,
 several as one program, a mix of tasks, and as many as `auto` takes. A sweep counts from the start
 of its first job to the end of its last, start-up included; beside it stand the steps per second
-while all places train.
+while all slots are busy.
 Writes `benchmarks/results/sweeps-<device>.json` after every sweep. What is interrupted or meets
 the deadline keeps what is through; a sweep that would not end in time is not started.
 """
@@ -122,7 +122,7 @@ def medians(runs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         per_hour = shown(figure([run["trainings_per_hour"] for run in done]), ".1f")
         steady = figure([rate for run in done if (rate := run["steady_steps_per_s"])])
         steps = shown(steady, ",.0f")
-        yield f"{way}: {per_hour} runs/h, {steps} steps/s while all places train"
+        yield f"{way}: {per_hour} runs/h, {steps} steps/s while all slots are busy"
 
 
 def _options() -> argparse.Namespace:

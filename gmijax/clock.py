@@ -50,7 +50,7 @@ running_s: Final = RunningClock()
 def wait_for(wait: Callable[[float], bool], timeout_s: float) -> bool:
     """Waits until `wait(seconds)` is true, such as that of an event; whether it was in time.
 
-    Only time in which this process runs counts, which one long `wait` could not tell.
+    Only time in which this process runs counts, which one long `wait` could not show.
     """
     deadline_s = running_s() + timeout_s
     while not wait(max(0.0, min(LONGEST_LOOK_S / 4, deadline_s - running_s()))):

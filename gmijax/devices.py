@@ -14,7 +14,7 @@ from jax.sharding import Sharding, SingleDeviceSharding
 from gmijax.errors import ConfigError
 
 PEAKS_BESIDE_JAX: list[Callable[[], int]] = []
-"""Each tells how many bytes of this process's GPU somebody had at most beside JAX."""
+"""Each returns how many bytes of this process's GPU somebody had at most beside JAX."""
 
 
 def start_device() -> None:

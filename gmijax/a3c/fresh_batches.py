@@ -37,7 +37,7 @@ class FreshBatch(NamedTuple):
 
 
 class FreshBatches:
-    """Takes the batches of one trainer, and tells the other trainers of them."""
+    """Takes the batches of one trainer, and announces them to the other trainers."""
 
     def __init__(
         self,

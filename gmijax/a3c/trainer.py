@@ -138,7 +138,7 @@ class Trainer:
         self.receiver.close()
         if leader is not None:
             leader.finish(state)
-        self._trace.close()  # Last: a job that is told to end has little time to save.
+        self._trace.close()  # Last: a job that is to end has little time to save.
         return "stopped" if is_stopped else "completed"
 
     def _example(self) -> tuple[Unrolls, Any]:

@@ -28,7 +28,7 @@ class ProfileWindow:
     """Whether a profile can be read: enough was done since its channels had filled.
 
     Agents compile for different times, and until the channels are full they never wait: nothing
-    that is counted before tells of a long job.
+    that is counted before is of a long job.
     """
 
     def __init__(self, config: TrainConfig, plan: Plan, run: RunPaths) -> None:
@@ -58,7 +58,7 @@ class ProfileWindow:
 def window_start(lines: Sequence[Line], iterations: int) -> int | None:
     """Index of the first of the latest lines that hold what a profile goes by; None: too few.
 
-    The line before it is needed too, because lines tell when they end. Something was made in
+    The line before it is needed too: the time of a line is that of its end. Something was made in
     them: where an unroll is many batches, agents can be silent for many lines.
     """
     batches = made = 0.0

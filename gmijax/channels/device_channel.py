@@ -130,7 +130,7 @@ class ResidentDecoder:
         self._received = ReceivedArrays(new_memory)
 
     def __call__(self, message: Message, agent: int) -> Rollouts:
-        """The rollout that a note tells of.
+        """The rollout that a note describes.
 
         Raises:
           CudaError: the agent's memory cannot be read here.

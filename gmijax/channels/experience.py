@@ -1,7 +1,7 @@
 """Experience by channel: what agents send and trainers get.
 
 All experience of one agent has the same spec: channels, numbers of steps, shapes, dtypes. It
-travels with every message, so that trainers need not be told before.
+travels with every message, so that trainers need not know it before.
 
 A *piece* is the experience of one `send`, or a part of its environments where the whole is too
 large for the channel. A *transfer* is what travels: one or more pieces.

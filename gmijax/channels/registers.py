@@ -2,7 +2,7 @@
 
 A register holds the newest value only. It is a seqlock with two buffers, written in turn: a reader
 that copies one is disturbed only if the writer begins to publish for the second time meanwhile,
-which a counter tells it. The order of memory accesses is kept by `Fence`.
+which a counter shows. The order of memory accesses is kept by `Fence`.
 
     fd = create_registers()                             # the controller
     registers = open_registers(fd, [64, 4096])          # every process, with the same sizes

@@ -136,7 +136,7 @@ class Sender:
         return self.migrator.least_occupancy()
 
     def close(self) -> None:
-        """Flushes, and tells the trainers that nothing more comes. Idempotent.
+        """Flushes, and announces to the trainers that nothing more comes. Idempotent.
 
         With `transport=device` it waits a while for trainers: what they have not read goes with
         this process.

@@ -97,14 +97,14 @@ class _Composer:
         self._made: dict[tuple[str, ...], dict[str, Any]] = {}
 
     def __call__(self, chosen: Mapping[str, str]) -> TrainConfig:
-        told = [f"{key}={value}" for key, value in chosen.items()]
+        given = [f"{key}={value}" for key, value in chosen.items()]
         kind = tuple(chosen[key] for key in self._groups)
         if kind in self._made:
             data = copy.deepcopy(self._made[kind])
-            items = [item for item in parse(told) if item.key_or_group not in self._groups]
+            items = [item for item in parse(given) if item.key_or_group not in self._groups]
             if all(_set(data, item.key_or_group, item.value()) for item in items):
                 return from_dict(TrainConfig, data)
-        config = build("train", TrainConfig, [*self._fixed, *told])
+        config = build("train", TrainConfig, [*self._fixed, *given])
         self._made[kind] = to_dict(config)
         return config
 

@@ -179,7 +179,7 @@ def _shown_default(key: str, values: Mapping[str, Any]) -> str:
         if isinstance(value, bool):
             return str(value).lower()
         return "null" if value is None else str(value)
-    # A group whose keys are the user's to choose: their names tell more than all their values.
+    # A group whose keys are the user's to choose: their names say more than all their values.
     names = {name.removeprefix(f"{key}.").split(".")[0] for name in values if f"{key}." in name}
     return ", ".join(sorted(names)) or "{}"
 

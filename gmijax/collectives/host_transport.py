@@ -107,7 +107,7 @@ class HostTransport:
             raise
 
     def exchange_s(self) -> float:
-        """Seconds that exchanges took which are through, and were not told before."""
+        """Seconds of the exchanges that have ended since the last call."""
         seconds, self._exchange_s = self._exchange_s, 0.0
         return seconds
 

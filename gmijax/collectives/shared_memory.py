@@ -67,7 +67,7 @@ def map_file(fd: int, num_bytes: int, who: str) -> mmap.mmap:
 
 
 def take_line(line: np.void, gmi: int) -> None:
-    """Notes this process in the line that tells others of GMI `gmi`.
+    """Notes this process in the line that shows others GMI `gmi`.
 
     Raises:
       CollectiveError: it is taken.

@@ -1,4 +1,4 @@
-"""Everything that `python -m gmijax.pack` can be told beside the command that it runs."""
+"""All keys of `python -m gmijax.pack`, beside the command that it runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Everything that `python -m gmijax.play` and `gmijax.export` can be told."""
+"""All keys of `python -m gmijax.play` and `gmijax.export`."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class ViewRunConfig(PlayRunConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class PlayConfig(KeyGroup):
-    """Everything that `python -m gmijax.play` can be told."""
+    """All keys of `python -m gmijax.play`."""
 
     run: PlayRunConfig
     physics: PhysicsConfig
@@ -136,7 +136,7 @@ class PlayConfig(KeyGroup):
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(KeyGroup):
-    """Everything that `python -m gmijax.export` can be told."""
+    """All keys of `python -m gmijax.export`."""
 
     run: ExportRunConfig
     checkpoint: str | None = doc(

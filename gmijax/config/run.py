@@ -26,7 +26,7 @@ class Timeouts(KeyGroup):
     )
     stop_timeout_s: float = doc(
         "time GMIs get to finish their iteration or unroll and save when a signal such as SIGTERM "
-        "tells the job to end, seconds; after Ctrl-C they get run.stall_timeout_s",
+        "asks the job to end, seconds; after Ctrl-C they get run.stall_timeout_s",
         positive=True,
     )
     grace_s: float = doc(

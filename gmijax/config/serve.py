@@ -1,4 +1,4 @@
-"""Everything that `python -m gmijax.serve` can be told."""
+"""All keys of `python -m gmijax.serve`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class OutputConfig(KeyGroup):
 
 @dataclass(frozen=True, kw_only=True)
 class ServeConfig(KeyGroup):
-    """Everything that `python -m gmijax.serve` can be told."""
+    """All keys of `python -m gmijax.serve`."""
 
     env: EnvConfig
     physics: PhysicsConfig

@@ -1,4 +1,4 @@
-"""What sweeps and packs share, and everything that `python -m gmijax.sweep` can be told."""
+"""What sweeps and packs share, and all keys of `python -m gmijax.sweep`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Everything that `python -m gmijax.train` can be told."""
+"""All keys of `python -m gmijax.train`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ALGORITHMS: tuple[type[AlgoConfig], ...] = get_args(AlgoConfig)
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(KeyGroup):
-    """Everything that `python -m gmijax.train` can be told."""
+    """All keys of `python -m gmijax.train`."""
 
     env: EnvConfig
     algo: AlgoConfig

@@ -1,4 +1,4 @@
-"""Everything that `gmijax view` can be told."""
+"""All keys of `gmijax view`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class PageConfig(KeyGroup):
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig(KeyGroup):
-    """Everything that `gmijax view` can be told."""
+    """All keys of `gmijax view`."""
 
     run: ViewRunConfig
     view: PageConfig

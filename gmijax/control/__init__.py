@@ -1,1 +1,1 @@
-"""The controller: plans, starts and watches jobs, searches, tells what there is."""
+"""The controller: plans, starts and watches jobs, searches, reports what there is."""

@@ -130,7 +130,7 @@ def started_from(
     """The configuration with `run.resume` as the path of a checkpoint, or null.
 
     What else it takes from other runs is the path of a checkpoint from then on too, so that all
-    GMIs, restarts and resumed runs take the same. `note` is told what was passed over for it.
+    GMIs, restarts and resumed runs take the same. `note` takes what was passed over for it.
 
     Raises:
       ConfigError: there is no such checkpoint.

@@ -99,7 +99,7 @@ class TanhNormal(Normal):
     """The tanh of a `Normal`: actions never leave [-1, 1].
 
     Its divergence is that of the Gaussians, which is the same before and behind the tanh. The
-    raw action cannot be told from the action: in float32, tanh is 1 of all that is above 9.
+    raw action cannot be recovered from the action: in float32, tanh is 1 of all that is above 9.
     """
 
     def action_of(self, raw: Array) -> Array:

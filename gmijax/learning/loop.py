@@ -237,7 +237,7 @@ class TrainingLoop:
             # it. This checkpoint then takes the place of the one without it.
             self._save(state, memory, replay, thread, evaluation)
         self._saver.finish()
-        self._trace.close()  # Last: a job that is told to end has little time to save.
+        self._trace.close()  # Last: a job that is to end has little time to save.
         return state, memory, stop
 
     def _evaluate(self, state: TrainState) -> Evaluation | None:

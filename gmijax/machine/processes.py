@@ -18,7 +18,7 @@ _ENDED = (b"Z", b"X")
 
 
 class GuardPipe:
-    """The write end of a pipe whose end of file tells a child that this process is gone.
+    """The write end of a pipe whose end of file shows a child that this process is gone.
 
     A process that the caller forks while the pipe is open would hold it open for longer than this
     one lives, so it is closed in every fork.
@@ -58,7 +58,7 @@ os.register_at_fork(after_in_child=GuardPipe._close_all)
 
 
 class ProcessId(NamedTuple):
-    """One process, told apart from a later one that got the same number."""
+    """One process, distinct from a later one that got the same number."""
 
     pid: int  # The process's number.
     start_ticks: int  # When it started, clock ticks since the machine booted.

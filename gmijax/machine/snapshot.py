@@ -236,7 +236,7 @@ def strange_owner(directory: Path) -> int | None:
 
 
 def _other_accelerators() -> Iterator[str]:
-    """What else could compute here, as far as device files tell."""
+    """What else could compute here, as far as device files show."""
     for pattern, what in _OTHERS.items():
         if found := sorted(nvidia.DEVICES.glob(pattern)):
             yield f"warning: {found[0]} looks like {what}, which gmijax does not use"

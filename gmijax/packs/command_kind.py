@@ -219,7 +219,7 @@ class CommandKind:
     def _is_suspect(self, running: Running[CommandJob], job: CommandJob) -> bool:
         """Whether a job may have caused the fault of its GPU that ended it.
 
-        CUDA tells all clients and does not say whose fault it was: the first to end is a
+        CUDA reports a fault to all clients, and not whose it was: the first to end is a
         suspect, and so is a job that was there at more than `_MAX_SHARED_FAULTS` faults.
         """
         gpu, now_s = (running.slot.site, running.slot.allocations[0].gpu), running_s()
@@ -258,7 +258,7 @@ class _Attempt:
     Attributes:
       silence: of its log.
       begins: byte of its log where what it prints begins.
-      resumes: whether it was told to go on from a checkpoint of its own.
+      resumes: whether it was asked to go on from a checkpoint of its own.
       is_client: whether it was seen to have its share of the GPU.
       client_asked_s: when that was asked; None: not yet.
     """

@@ -116,7 +116,7 @@ class PlainEnv:
 
     @property
     def command(self) -> Floats | None:
-        """What the policy is told to do, None in a task without commands.
+        """The command of the policy, None in a task without commands.
 
         It may be set, and is observed from the end of the next step on. See `command_limits`.
         """
@@ -125,9 +125,9 @@ class PlainEnv:
 
     @command.setter
     def command(self, value: npt.ArrayLike) -> None:
-        told, task = self.command, self.state.task
+        command, task = self.command, self.state.task
         new = np.asarray(value, np.float32)
-        if told is None or new.shape != told.shape:
+        if command is None or new.shape != command.shape:
             raise ValueError(f"{self._task} takes no command of shape {new.shape}")
         self.state = self.state._replace(task=task._replace(command=new))
 

@@ -35,7 +35,7 @@ MOST_LEFT: Final = 0.5
 """Most of the environments that may leave the field: the others say how the policy walks."""
 
 LEAST_ENVS: Final = 100
-"""With fewer environments 99 % cannot be told from less, and the test does not decide."""
+"""With fewer environments 99 % cannot be distinguished from less, and the test does not decide."""
 
 
 class Recording(NamedTuple):

@@ -51,7 +51,7 @@ def plan(
         "sm_percent": sm_percent,
         "memory_fraction": memory_fraction,
     }
-    # As from a command line: what is no number, or not among the allowed, is told in one line.
+    # As from a command line: what is no number, or not among the allowed, is one line.
     wanted = from_dict(PlanConfig, {key: _plain(value) for key, value in given.items()}, "plan.")
     # A role's data are in host memory, so other strategies have nothing to offer.
     made = make_plan(wanted, ReduceConfig(strategy="mpr"), 0, detect_machine())

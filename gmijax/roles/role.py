@@ -157,7 +157,7 @@ class Role(ABC):
         """Waits for the next message of GMI `src`, and returns it.
 
         Its arrays are this GMI's own; those of jax are jax's still where they could stay on the
-        GPU, and numpy's else. With `timeout_s=None` the wait is what `gmijax.launch` was told.
+        GPU, and numpy's else. With `timeout_s=None` the wait is what `gmijax.launch` was given.
 
         Raises:
           PeerLost: that GMI is gone, and has left no message.

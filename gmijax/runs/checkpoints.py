@@ -50,7 +50,7 @@ class CheckpointMeta:
     window_full: bool = False
     # A time limit of all its environments together, in environment steps; None: not known.
     limit_steps: float | None = None
-    # As the run was told, that of the schedule is in the learner's state.
+    # As the run was given it; that of the schedule is in the learner's state.
     learning_rate: float | None = None
     # When it was written, seconds since 1970: files get new times when a run is copied.
     time_s: float | None = None

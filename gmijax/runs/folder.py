@@ -31,7 +31,7 @@ UNFINISHED, REMOVED = ".partial", ".removed"
 """Ends of the names of checkpoints that are written or removed, which begin with a dot."""
 
 EXIT_NO_GL = 3
-"""Exit code of the renderer where the OpenGL that it was told to use cannot be had."""
+"""Exit code of the renderer where the OpenGL that it was to use cannot be had."""
 
 NO_RUN_FOLDER: Final = "is not a run folder, and is not empty"
 

@@ -125,7 +125,7 @@ def is_locked(lock: Path) -> bool:
     try:
         fd = try_lock(lock)
     except OSError:
-        return False  # Whoever wants it is told why it cannot be had.
+        return False  # Whoever wants it gets the reason later.
     if fd is not None:
         os.close(fd)
     return fd is None

@@ -16,7 +16,7 @@ class GmiStatus(NamedTuple):
 
     Attributes:
       gmi: its id.
-      state: `stopping` once a running one was told to end, else what it says (see `heartbeat`).
+      state: `stopping` once a running one was asked to end, else from its `heartbeat`.
       iteration: training iterations done.
       pid: its process, None before the start.
       exit_code: None while it runs; negative for the signal that ended it.

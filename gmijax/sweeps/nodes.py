@@ -156,7 +156,7 @@ def nodes_of(
 
 
 def num_cpus_of(settings: JobsConfig, processes: int) -> int:
-    """CPUs of each node that Ray is asked for: one for every GMI that the settings tell of."""
+    """CPUs of each node that Ray is asked for: one for every GMI that the settings name."""
     each = 1 if settings.jobs_per_gpu == "auto" else settings.jobs_per_gpu
     gpus = settings.gpus if isinstance(settings.gpus, int) else 1
     return gpus * each * processes

@@ -40,7 +40,7 @@ class SweepPaths(RunPaths):
         return self.job(number).root
 
     def order(self, number: int) -> Path:
-        """What the process of a job is told."""
+        """What the process of a job is given."""
         return self.root / "jobs" / f"{number:0{DIGITS}d}.json"
 
     def log(self, number: int) -> Path:

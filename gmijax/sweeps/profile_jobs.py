@@ -97,7 +97,7 @@ def _train(
 
 
 def profiled_job(job: Job, seed: int, num_timesteps: int) -> Job:
-    """The job with another seed and length, without what costs time or tells anybody of it."""
+    """The job with another seed and length, without what costs time or reports to anybody."""
     run = dataclasses.replace(
         job.config.run, checkpoint_every=0, measure_throughput=False, max_restarts=0, profile=None
     )

@@ -222,7 +222,7 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
 
 
 def shown(value: float | None, is_full: bool, episodes: int | None) -> str:
-    """A value for people, who are told where it cannot be compared."""
+    """A value for people, with a note where it cannot be compared."""
     if value is None:
         return "-"
     if is_full:

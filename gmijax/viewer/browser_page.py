@@ -89,12 +89,12 @@ class BrowserPage:
         above = np.array([0.0, 0.0, 0.4 * width])
         arrows: dict[int, Arrow] = {}
         for number, env in enumerate(simulation.envs):
-            told = dict(zip(names, np.asarray(env.command), strict=True))
+            command = dict(zip(names, np.asarray(env.command), strict=True))
             w, x, y, z = xquat[number, simulation.pushed]
             yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
             ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
             aside = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
             start = xpos[number, simulation.pushed] + above
-            way = told[_FORWARD] * ahead + told[_LEFT] * aside
+            way = command[_FORWARD] * ahead + command[_LEFT] * aside
             arrows[number] = (start, start + _ARROW * width * way)
         return arrows

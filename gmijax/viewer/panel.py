@@ -128,8 +128,8 @@ class Panel:
 
         async def send_command(_: Any) -> None:
             values = iter(sliders)
-            told = tuple(next(values).value if limit > 0.0 else 0.0 for limit in limits.values())
-            self._put(requests.SetCommand(None if drawn.value else told))
+            command = [next(values).value if limit > 0.0 else 0.0 for limit in limits.values()]
+            self._put(requests.SetCommand(None if drawn.value else tuple(command)))
 
         async def take(event: Any) -> None:
             if event.client is not None:  # Moved by somebody, not by us.

@@ -58,7 +58,7 @@ class Drag(NamedTuple):
 
 
 class SetCommand(NamedTuple):
-    """What the robots are told to do; None: what the task draws."""
+    """The command of the robots; None: what the task draws."""
 
     command: tuple[float, ...] | None
 

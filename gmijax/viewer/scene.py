@@ -28,7 +28,7 @@ Color: TypeAlias = tuple[int, int, int]
 Arrow: TypeAlias = tuple[Floats, Floats]
 
 _LAST_VISIBLE_GROUP: Final = 2
-"""MuJoCo's own viewers draw geoms of groups 0 to 2, unless they are told otherwise."""
+"""MuJoCo's own viewers draw geoms of groups 0 to 2, unless they are set otherwise."""
 
 _GAP: Final = 1.5
 """From one environment to the next, in widths of the model."""

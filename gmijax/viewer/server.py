@@ -83,7 +83,7 @@ def _listen(host: str, port: int) -> socket.socket:
     """A listening socket. Of our own, because viser takes the port for one of a thousand."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        # For `localhost` that of IPv4, which `ssh -L` is told.
+        # For `localhost` that of IPv4, which `ssh -L` is given.
         family, *_, address = min(found, key=lambda one: one[0] != socket.AF_INET)
         for candidate in range(port, min(port + _PORTS_TRIED, 65536)) if port else (0,):
             try:

@@ -3,7 +3,7 @@
 A process of its own, so that nothing of it can end or delay training. It draws one film at a time,
 of what the leader has left in `<run>/videos/`. If drawing is slower than evaluations come, only
 the newest of those that wait is filmed. Its standard input ends when the job does: it films what
-is left if it was told to finish, and else ends at once.
+is left if it was asked to finish, and else ends at once.
 """
 
 from __future__ import annotations

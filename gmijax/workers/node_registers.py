@@ -22,7 +22,7 @@ def over_nodes(
     leader: int,
     held: ExitStack,
 ) -> JobRegisters:
-    """The registers as `gmi` uses them; `local` are those of its node, `sizes` as it was told.
+    """The registers as `gmi` uses them; `local` are those of its node, `sizes` as it was given.
 
     Raises:
       CollectiveError, ConfigError: as `Connection`.

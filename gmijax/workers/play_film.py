@@ -1,7 +1,7 @@
 """Draws films. Main of the filming child of `gmijax.play`. No jax here.
 
 `play_film.py PLAY_FOLDER [S]` films a played checkpoint, briefly if it is to take S seconds;
-without a folder it tells by its exit code whether it could.
+without a folder its exit code shows whether it could.
 
 Draws a trajectory with MuJoCo, without a display, through the OpenGL that MUJOCO_GL names. That
 choice is made when mujoco is imported and cannot be changed after, hence a child of its own.
@@ -37,7 +37,7 @@ BRIEF_FPS, BRIEF_LEAST_FPS = 15.0, 12.5
 first: with fewer frames a second nothing is seen to move."""
 
 _TRIED = 3
-"""Pictures that tell how long one takes: somebody else may use the machine meanwhile."""
+"""Pictures that are timed: somebody else may use the machine during one of them."""
 
 _H264_CRF = "20"
 _GIF_MAX_WIDTH = 480

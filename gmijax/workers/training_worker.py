@@ -238,7 +238,7 @@ def _trainers_communicator(
         rendezvous_timeout_s=config.run.start_timeout_s,
         intra=plan.intra,
         inter=plan.inter,
-        # Whoever asks for it by name is told that it does not work.
+        # Whoever asks for it by name gets an error that it does not work.
         host_if_unavailable=config.reduce.strategy != "one_shot",
         nodes=nodes,
         listener=listener,

@@ -91,7 +91,7 @@ class CudaQueue:
         self._clocks.append(self._clock)
 
     def clocked_s(self) -> float:
-        """Seconds that counted and have not been told before; of clocks that have stopped."""
+        """Seconds of clocks that count and have stopped since the last call."""
         total_ms = 0.0
         success = runtime.cudaError_t.cudaSuccess
         while self._clocks and runtime.cudaEventQuery(self._clocks[0][1])[0] == success:

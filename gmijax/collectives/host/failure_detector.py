@@ -93,7 +93,7 @@ class FailureDetector:
         return running_s() - self._clock_s
 
     def _is_gone(self, peer: int) -> bool:
-        # A rank that has not attached cannot be told from one that is still starting.
+        # A rank that has not attached cannot be distinguished from one that is still starting.
         attached = self._block.lines["sequence"][peer]
         fence()  # Its process was noted before.
         return bool(attached) and not process_of(self._block.lines[peer]).is_running()

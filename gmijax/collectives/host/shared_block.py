@@ -47,7 +47,7 @@ LINE = np.dtype(
         ("suspect", np.uint64),  # of the first lane alone, see `SharedBlock`
     ]
 )
-"""What one rank tells the others; exactly one cache line, so that ranks do not share any."""
+"""What one rank publishes for the others; exactly a cache line, so that ranks share none."""
 
 
 class SharedBlock(NamedTuple):

@@ -1,7 +1,7 @@
 """How the leaders of nodes find each other, and prove that they belong to one job.
 
 Before a GMI is started every node opens a listening socket, which its leader inherits; then all
-leaders are told all addresses, and a secret. Node i connects to the nodes before it, and both ends
+leaders get all addresses, and a secret. Node i connects to the nodes before it, and both ends
 prove that they know the secret (`handshake.py`). When all are there nobody listens any more.
 """
 

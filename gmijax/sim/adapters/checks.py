@@ -1,6 +1,6 @@
 """Is this an environment? Asked when one comes from outside, before anything is compiled for long.
 
-Reset and step are traced, not run: that takes a second or two, and tells shapes and dtypes.
+Reset and step are traced, not run: that takes a second or two, and gives shapes and dtypes.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> En
 
 
 def _with_overflow(env: Env) -> Env:
-    """`env` in MJX-Warp, which tells of buffers that were too small in the last step."""
+    """`env` in MJX-Warp, which reports buffers that were too small in the last step."""
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         # MJX-Warp only ever adds bits.
