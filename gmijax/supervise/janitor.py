@@ -157,7 +157,7 @@ def _kill(groups: _Groups, daemons: Iterable[MpsControl]) -> None:
                 control.terminate_client(server, client)
     left = _with_members(groups)
     for group in left:
-        with suppress(ProcessLookupError):
+        with suppress(ProcessLookupError, PermissionError):  # `sudo` runs as another user.
             os.killpg(group, signal.SIGKILL)
     _wait_until_empty(left, _DAEMON_ENDS_S)
 
