@@ -101,7 +101,8 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
     Raises:
       ConfigError: bad input, before anything was started.
       GmiFailed: a GMI failed; finished shards of experience stay.
-      JobInterrupted: SIGINT, SIGTERM or SIGHUP came; the same command goes on with what is there.
+      JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came; the same command goes on with what
+        is there.
     """
     require_config(config, ServeConfig)
     console = open_console(show=show)
