@@ -112,8 +112,8 @@ class LocalHost:
     def order(self, child: int, order: Order) -> None:
         """Calls a method of a child."""
         # Killing a client that is busy can harm its neighbours.
-        is_killing = order == "kill" or (order == "close" and child in self._clients)
-        if is_killing and self._backend is not None and child in self._clients:
+        is_killing = order in ("kill", "close") and child in self._clients
+        if is_killing and self._backend is not None:
             self._backend.terminate(self._clients[child], self._pids_of(child))
         getattr(self._children[child], order)()
         if order == "close":
