@@ -131,6 +131,7 @@ def show_nodes(address: str, *, as_json: bool) -> Sequence[str]:
 
     Raises:
       ConfigError: there is no such cluster.
+      NodeLost: a node is gone while it is asked.
     """
     from gmijax.cluster.survey import differences, lines_of_nodes, nodes_as_data, survey
 

@@ -11,6 +11,7 @@ from gmijax.cluster.checks import by_name, differences_in_versions
 from gmijax.cluster.node import Facts, Node
 from gmijax.cluster.ray_nodes import RayCluster
 from gmijax.config import ClusterConfig
+from gmijax.errors import NodeLost
 from gmijax.machine.differences import differences_in, differences_in_gpus, gpu_names
 
 _LITTLE: Final = 0.001
@@ -54,13 +55,16 @@ def survey(address: str) -> dict[str, NodeInfo]:
 
     Raises:
       ConfigError: there is no cluster.
+      NodeLost: a node is gone while it is asked.
     """
     cluster = RayCluster(ClusterConfig(engine="ray", address=address, wait_s=0.0), SurveyedNode)
     try:
         found: dict[str, NodeInfo] = {}
         for name, node in by_name(cluster.join(_LITTLE, None)).items():
             before_s = time.time()
-            theirs_s = node.remote.call("clock") or 0.0
+            theirs_s = node.remote.call("clock")
+            if node.remote.lost is not None:
+                raise NodeLost(node.remote.lost)
             found[name] = NodeInfo(node.facts, theirs_s - (before_s + time.time()) / 2)
         return found
     finally:

@@ -78,8 +78,9 @@ def filmed(gl: str | None, run: RunPaths, say: Callable[[str], None]) -> Iterato
             process.send(FINISH)
             if _waiting(run):
                 say("filming the last evaluation")
-        if not process.end(LAST_FILM_TIMEOUT_S if is_well else _GIVE_UP_S):
-            say(f"eval.video: the last film was given up after {LAST_FILM_TIMEOUT_S:g} s")
+        timeout_s = LAST_FILM_TIMEOUT_S if is_well else _GIVE_UP_S
+        if not process.end(timeout_s):
+            say(f"eval.video: the last film was given up after {timeout_s:g} s")
         if not _waiting(run):
             with suppress(OSError):
                 run.filmed_model.unlink(missing_ok=True)

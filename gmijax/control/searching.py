@@ -28,7 +28,7 @@ def search(
     Raises:
       ConfigError: bad input, before anything was started, or a budget too small for one profile.
       GmijaxError: no point can run.
-      JobInterrupted: SIGINT, SIGTERM or SIGHUP came; the profiles so far are kept.
+      JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came; the profiles so far are kept.
     """
     require_config(config, TrainConfig)
     if config.run.resume is not None:

@@ -12,7 +12,7 @@ import json
 import shlex
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -31,7 +31,7 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.templates import SIMULATOR, group_of
 from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.compile_times import CompileTime
-from gmijax.runs.dataset import DataPaths, open_dataset
+from gmijax.runs.dataset import DataPaths, open_dataset, remove_begun
 from gmijax.runs.folder import (
     RunPaths,
     create_run,
@@ -101,7 +101,8 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
     Raises:
       ConfigError: bad input, before anything was started.
       GmiFailed: a GMI failed; finished shards of experience stay.
-      JobInterrupted: SIGINT, SIGTERM or SIGHUP came; the same command goes on with what is there.
+      JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came; the same command goes on with what
+        is there.
     """
     require_config(config, ServeConfig)
     console = open_console(show=show)
@@ -109,13 +110,12 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
     folders: list[OpenFolder] = []
     with ExitStack() as held:
         if (data := job.data) is not None:
-            is_new = not data.dataset.exists()
+            is_new, is_begun = not data.root.exists(), data.dataset.exists()
             open_dataset(data, _about(job))
             shown = f"output.dir={nearby(data.root)}"
             folders.append(held.enter_context(locked(data.lock, shown)))
-            if is_new:
-                no_shard = partial(_has_no_shard, data)
-                held.enter_context(gone_if_unused(data.root, no_shard))
+            if not is_begun:
+                held.enter_context(_gone_without_shard(job, data, is_new=is_new))
         kept = job.finished_unrolls()
         if data is not None and kept and kept == job.wanted_unrolls:
             raise ConfigError(
@@ -150,8 +150,15 @@ def _has_collected_nothing(job: _ServingJob, run: RunPaths) -> bool:
     return not any(read_metrics(run.gmi(gmi).metrics) for gmi in job.simulators)
 
 
-def _has_no_shard(data: DataPaths) -> bool:
-    return next(data.finished(), None) is None
+def _gone_without_shard(
+    job: _ServingJob, data: DataPaths, *, is_new: bool
+) -> AbstractContextManager[None]:
+    """Takes the job's files from its output folder again, unless a shard was finished."""
+    return gone_if_unused(
+        data.root,
+        lambda: next(data.finished(), None) is None,
+        lambda _: remove_begun(data, len(job.simulators), is_new=is_new),
+    )
 
 
 def _prepared(config: ServeConfig, console: Console) -> _ServingJob:

@@ -118,8 +118,17 @@ def that_have_open(path: Path) -> dict[int, str]:
     for entry in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # It may end meanwhile.
             if any(_leads_to(fd, path) for fd in (entry / "fd").iterdir()):
-                name = (entry / "comm").read_text(errors="replace")
-                found[int(entry.name)] = printable(name.strip())
+                found |= names_of([int(entry.name)])
+    return found
+
+
+def names_of(pids: Iterable[int]) -> dict[int, str]:
+    """Numbers and names of those of the processes that have not ended, whoever's they are."""
+    found = {}
+    for pid in pids:
+        with suppress(OSError):
+            name = Path(f"/proc/{pid}/comm").read_text(errors="replace")
+            found[pid] = printable(name.strip())
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -18,7 +19,11 @@ _LOOK_S: Final = 10.0
 _LENGTH: Final = struct.Struct("<Q")
 _CHECK: Final = 4  # Bytes of a checksum: one after the length, one after the data.
 _MOST_BYTES: Final = 1 << 24
-"""Of one record. A longer one is no event, so the file is not read on."""
+"""Of one look, which must stay short. A longer record, such as a film, has no scalar."""
+_LONGEST_BYTES: Final = 1 << 31
+"""Of one record, as of any protobuf message. A file that tells of more is damaged."""
+_DAMAGED: Final = 1 << 63
+"""In place of where to read on: further than any file is long."""
 
 
 class EventReader:
@@ -57,18 +62,32 @@ class EventReader:
 
         from gmijax.runs.tensorboard import Event
 
-        try:
-            with path.open("rb") as file:
-                file.seek(self._offsets[path])
-                found = file.read(_MOST_BYTES)
-        except OSError:
-            return
-        at = 0
-        while (data := _record(found, at)) is not None:
-            at += _LENGTH.size + len(data) + 2 * _CHECK
+        for data in self._new_records(path):
             with suppress(DecodeError):
                 yield from self._values(Event.FromString(data))
-        self._offsets[path] += at
+
+    def _new_records(self, path: Path) -> list[bytes]:
+        """Data of records that are complete; long ones are passed over without being read."""
+        records: list[bytes] = []
+        num_bytes, offset = 0, self._offsets[path]
+        with suppress(OSError, struct.error), path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            while num_bytes < _MOST_BYTES and offset + _LENGTH.size <= size:
+                file.seek(offset)
+                (length,) = _LENGTH.unpack(file.read(_LENGTH.size))
+                if length > _LONGEST_BYTES:
+                    offset = _DAMAGED
+                    break
+                ends = offset + _LENGTH.size + length + 2 * _CHECK
+                if ends > size:
+                    break
+                if length <= _MOST_BYTES:
+                    file.seek(_CHECK, os.SEEK_CUR)
+                    records.append(file.read(length))
+                    num_bytes += ends - offset
+                offset = ends
+        self._offsets[path] = offset
+        return records
 
     def _values(self, event: Any) -> Iterator[Report]:
         for value in event.summary.value:
@@ -79,13 +98,3 @@ class EventReader:
             if value.HasField("tensor") and value.tensor.float_val:
                 number = value.tensor.float_val[0]
             yield Report(steps=float(event.step), metric=float(number))
-
-
-def _record(found: bytes, at: int) -> bytes | None:
-    """The data of the record that begins at a byte; None: it is not complete."""
-    begins = at + _LENGTH.size + _CHECK
-    if begins > len(found):
-        return None
-    (length,) = _LENGTH.unpack_from(found, at)
-    ends = begins + length
-    return found[begins:ends] if ends + _CHECK <= len(found) else None

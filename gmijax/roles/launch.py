@@ -68,7 +68,7 @@ def launch(
         operation that there is not.
       GmiFailed: a role raised, or its process ended; names the first. Its notes have the
         traceback and the run folder.
-      JobInterrupted: SIGINT, SIGTERM or SIGHUP came, and all GMIs have ended.
+      JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came, and all GMIs have ended.
     """
     # Before anything else: the module of a GMI's role starts jobs without end otherwise.
     _require_no_gmi()

@@ -11,7 +11,9 @@ file, or of another size than it says, is unfinished and is made again.
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -103,6 +105,23 @@ def open_dataset(paths: DataPaths, about: Mapping[str, Any]) -> None:
             write_json(paths.dataset, about)
     except OSError as error:
         raise ConfigError(f"output.dir={nearby(paths.root)}: {error.strerror}") from None
+
+
+def remove_begun(paths: DataPaths, num_simulators: int, *, is_new: bool) -> None:
+    """Removes what a job has written before its first shard was finished, and nothing else.
+
+    Args:
+      paths: its folder.
+      num_simulators: of the job.
+      is_new: whether the job has made the folder, which then goes too if it is empty.
+    """
+    for rank in range(num_simulators):
+        shutil.rmtree(paths.folder(rank), ignore_errors=True)
+    with suppress(OSError):
+        for path in (paths.dataset, paths.lock):
+            path.unlink(missing_ok=True)
+        if is_new:
+            paths.root.rmdir()
 
 
 def _check_same(paths: DataPaths, about: Mapping[str, Any]) -> None:

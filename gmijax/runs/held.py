@@ -87,16 +87,25 @@ def locked(lock: Path, what: str) -> Iterator[OpenFolder]:
 
 
 @contextmanager
-def gone_if_unused(root: Path, is_empty: Callable[[], bool] = lambda: True) -> Iterator[None]:
+def gone_if_unused(
+    root: Path,
+    is_empty: Callable[[], bool] = lambda: True,
+    remove: Callable[[Path], None] = lambda root: shutil.rmtree(root, ignore_errors=True),
+) -> Iterator[None]:
     """Removes a folder that a job made, if it is refused or interrupted before it holds anything.
 
     A backend that cannot be had is no such input: its logs, which the error names, stay.
+
+    Args:
+      root: the folder.
+      is_empty: whether it holds nothing yet.
+      remove: removes it, or what the job has written there.
     """
     try:
         yield
     except (ConfigError, JobInterrupted) as error:
         if not isinstance(error, BackendUnavailable) and is_empty():
-            shutil.rmtree(root, ignore_errors=True)
+            remove(root)
         raise
 
 

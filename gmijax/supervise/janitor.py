@@ -33,6 +33,7 @@ from gmijax.machine.processes import (
     members_of,
     wait_until_gone,
 )
+from gmijax.supervise.stop_signals import STOP_SIGNALS
 
 _GMIS_END_THEMSELVES_S = 8.0
 _DAEMON_ENDS_S = 10.0
@@ -124,7 +125,7 @@ def quit_daemon(control: MpsControl) -> None:
 
 def main() -> int:
     """Reads messages until the pipe ends, then cleans up unless the controller has."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in STOP_SIGNALS:  # They may come to all processes of a job.
         signal.signal(number, signal.SIG_IGN)
     groups: defaultdict[int, set[ProcessId]] = defaultdict(set)
     daemons: list[MpsControl] = []
@@ -157,7 +158,7 @@ def _kill(groups: _Groups, daemons: Iterable[MpsControl]) -> None:
                 control.terminate_client(server, client)
     left = _with_members(groups)
     for group in left:
-        with suppress(ProcessLookupError):
+        with suppress(ProcessLookupError, PermissionError):  # `sudo` runs as another user.
             os.killpg(group, signal.SIGKILL)
     _wait_until_empty(left, _DAEMON_ENDS_S)
 

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 from gmijax.clock import running_s
 from gmijax.errors import GmijaxError, JobNotStarted
-from gmijax.machine.processes import GuardPipe, ProcessId, members_of
+from gmijax.machine.processes import GuardPipe, ProcessId, has_ended, members_of
 from gmijax.runs.folder import write_json
 from gmijax.runs.held import try_lock
 from gmijax.supervise.failures import last_line
@@ -31,6 +31,9 @@ processes or memory."""
 
 _STAY_S = 15.0
 """Longest wait for the rest of a process group whose leader has ended."""
+
+_KILLED_S = 5.0
+"""Longest wait for the end of a process that was killed: a driver may hold it."""
 
 
 class ChildStatus(NamedTuple):
@@ -84,7 +87,10 @@ class Child:
       variables: environment variables of its slot.
 
     Attributes:
+      lock: see `Process`.
       rest: what still runs of its process group, once the leader has ended.
+      left: what still ran of it when it was closed: a driver may hold it, and what is another
+        user's, as with `sudo`, cannot be killed.
 
     Raises:
       JobNotStarted: it cannot be started.
@@ -96,7 +102,10 @@ class Child:
         self._is_client, self._is_asked = process.is_client, False
         self._pipe = GuardPipe()
         self._ended_s: float | None = None
+        self._killed_s: float | None = None
+        self.lock = process.lock
         self.rest: tuple[ProcessId, ...] = ()
+        self.left: tuple[ProcessId, ...] = ()
         lifeline = (self._pipe.read_end,) if process.has_lifeline else ()
         try:
             with errors_of_one_job(process.cwd):
@@ -133,7 +142,7 @@ class Child:
         A controller asks its GMIs. A command may be a shell, which does not pass a signal on: it
         comes to all of its process group, as Ctrl-C does.
         """
-        with suppress(ProcessLookupError):
+        with suppress(ProcessLookupError, PermissionError):
             if not self._is_client:
                 self._process.send_signal(self._stop_signal)
             elif not self._is_asked:  # A second signal could end it before it has saved.
@@ -149,14 +158,17 @@ class Child:
 
     def kill(self) -> None:
         """Ends it now, and its process group; GMIs end with their controller."""
-        with suppress(ProcessLookupError):
+        self._killed_s = self._killed_s or running_s()
+        with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """After its end; what is left of its process group ends too."""
+        """After its end, or in place of it; what is left of its process group ends too."""
         self.kill()
         self._pipe.close()
-        self._process.wait()
+        killed_s = self._killed_s or running_s()
+        has_ended(self._process, killed_s + _KILLED_S - running_s())
+        self.left = members_of(self.pid)
 
 
 @contextmanager

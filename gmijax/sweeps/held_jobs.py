@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
 from gmijax.clock import running_s
-from gmijax.machine.processes import that_have_open
+from gmijax.machine.processes import ProcessId, names_of, that_have_open
 from gmijax.runs.held import is_locked
 from gmijax.sweeps.any_job import AnyJob
 from gmijax.sweeps.paths import SweepPaths
@@ -73,20 +73,32 @@ class HeldJobs:
         return f"{_holds(self._paths.job(job.number).lock)}, then give the same command{was}"
 
 
-def left_behind(jobs: Iterable[AnyJob], paths: SweepPaths) -> list[str]:
-    """Which processes of jobs that were ended still run, in words: a text for each such job."""
+def left_behind(
+    jobs: Iterable[AnyJob], paths: SweepPaths, killed: Sequence[tuple[Path, ProcessId]]
+) -> list[str]:
+    """Which processes of jobs that were ended still run, in words: a text for each such job.
+
+    Args:
+      jobs: all.
+      paths: their files.
+      killed: processes that did not end at once when they were killed, each with the lock of its
+        job; they may not hold it, `sudo` closes it.
+    """
     locks = {job.number: paths.job(job.number).lock for job in jobs if job.progress.attempts}
     deadline_s = running_s() + _ENDING_S
-    while held := {number: lock for number, lock in locks.items() if is_locked(lock)}:
-        if running_s() >= deadline_s:
+    while True:
+        left = [(lock, process.pid) for lock, process in killed if process.is_running()]
+        of_job = {n: [pid for at, pid in left if at == lock] for n, lock in locks.items()}
+        held = {n: lock for n, lock in locks.items() if of_job[n] or is_locked(lock)}
+        if not held or running_s() >= deadline_s:
             break
         time.sleep(_POLL_S)
-    return [f"job {number}: {_holds(lock)}" for number, lock in held.items()]
+    return [f"job {number}: {_holds(lock, of_job[number])}" for number, lock in held.items()]
 
 
-def _holds(lock: Path) -> str:
-    """Which processes hold a folder, and what to do."""
-    found = that_have_open(lock)
+def _holds(lock: Path, known: Iterable[int] = ()) -> str:
+    """Which processes hold a folder, beside those that are known, and what to do."""
+    found = names_of(known) | that_have_open(lock)
     if not found:
         return f"a process that is not found here still holds {lock}: end it"
     names = ", ".join(f"{pid} ({name})" for pid, name in found.items())

@@ -6,11 +6,12 @@ import json
 import os
 from collections.abc import Iterable
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 from gmijax.machine.mps_control import MEMORY_LIMIT_VARIABLE, PIPE_VARIABLE
 from gmijax.machine.nvidia import GpuLoad, load_of
-from gmijax.machine.processes import started_by
+from gmijax.machine.processes import ProcessId, started_by
 from gmijax.machine.snapshot import DAEMONS_VARIABLE, Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.cache import cache_folder
@@ -38,6 +39,7 @@ class LocalHost:
       name: address of a node; None: this machine.
       machine: what it has.
       lost: why it is gone; None while it answers.
+      left: processes of jobs that could not be ended, each with the lock of its job.
     """
 
     name: str | None = None
@@ -45,6 +47,7 @@ class LocalHost:
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
+        self.left: list[tuple[Path, ProcessId]] = []
         self._leases, self._entered = ExitStack(), ExitStack()
         self._backend: Backend | None = None
         self._children: dict[int, Child] = {}
@@ -109,12 +112,14 @@ class LocalHost:
     def order(self, child: int, order: Order) -> None:
         """Calls a method of a child."""
         # Killing a client that is busy can harm its neighbours.
-        is_killing = order == "kill" or (order == "close" and child in self._clients)
-        if is_killing and self._backend is not None and child in self._clients:
+        is_killing = order in ("kill", "close") and child in self._clients
+        if is_killing and self._backend is not None:
             self._backend.terminate(self._clients[child], self._pids_of(child))
         getattr(self._children[child], order)()
         if order == "close":
-            del self._children[child]
+            closed = self._children.pop(child)
+            if closed.lock is not None:
+                self.left += [(closed.lock, process) for process in closed.left]
             self._clients.pop(child, None)
 
     def why_no_client(self, child: int) -> str | None:
@@ -141,9 +146,9 @@ class LocalHost:
 
     def close(self) -> None:
         """Ends what is left, and gives back all."""
-        for number in list(self._children):
-            self.order(number, "kill")
-            self.order(number, "close")
+        for order in ("kill", "close"):  # So that they end at the same time.
+            for number in list(self._children):
+                self.order(number, order)
         self.shut()
         self._leases.close()
 

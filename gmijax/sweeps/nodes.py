@@ -14,6 +14,7 @@ from gmijax.config import ClusterConfig
 from gmijax.config.sweep import JobsConfig
 from gmijax.errors import ConfigError, GmijaxError, NodeLost
 from gmijax.machine.nvidia import GpuLoad
+from gmijax.machine.processes import ProcessId
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
@@ -54,7 +55,12 @@ class RemoteHost:
     """A node as the scheduler sees it, with the methods of a `LocalHost`.
 
     Those that need an answer raise `NodeLost` if it is gone.
+
+    Attributes:
+      left: see `LocalHost`; of a node that is not known.
     """
+
+    left: tuple[tuple[Path, ProcessId], ...] = ()
 
     def __init__(self, joined: NodeHandle, name: str) -> None:
         self.name: str | None = name

@@ -104,7 +104,7 @@ def _run(
         if (wrong := report.end(status)) is not None:
             error.add_note(wrong)
         job_events.end(report.data)
-        for left in left_behind(jobs, paths):
+        for left in left_behind(jobs, paths, [one for host in hosts for one in host.left]):
             error.add_note(left)
         _say_how_to_continue(error, work, jobs, paths)
         raise

@@ -146,6 +146,17 @@ def test_daemon_that_is_gone_when_shares_are_verified_is_a_failure(mps: FakeMps,
             backend.verify({0: os.getpid(), 1: os.getpid()})
 
 
+def test_clients_of_a_daemon_that_was_renewed_are_terminated(mps: FakeMps, run: RunPaths):
+    here, plan = two_clients(mps)
+    with open_backend(plan, here, run) as backend:
+        MpsControl(mps.program, mps.pipe_directories()[0]).quit()
+        backend.terminate(0, [os.getpid()])
+        backend.renew(1)
+        (mps.pipe_directories()[1] / "clients" / str(os.getpid())).touch()
+        backend.terminate(1, [os.getpid()])
+    assert [int(client) for _, client in mps.told("terminate_client")] == [os.getpid()]
+
+
 def test_clients_are_terminated_before_they_are_killed(mps: FakeMps, run: RunPaths):
     here, plan = two_clients(mps)
     pids: list[int | None] = []

@@ -33,7 +33,7 @@ from gmijax.cluster.node import (
 )
 from gmijax.cluster.ray_nodes import NodeHandle, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
-from gmijax.cluster.survey import NodeInfo, differences, lines_of_nodes, nodes_as_data
+from gmijax.cluster.survey import NodeInfo, differences, lines_of_nodes, nodes_as_data, survey
 from gmijax.collectives.nodes.rendezvous import NodeAddresses
 from gmijax.config import ClusterConfig, PlanConfig, ReduceConfig
 from gmijax.errors import (
@@ -286,6 +286,19 @@ def test_the_doctor_says_in_what_nodes_differ() -> None:
     assert line.startswith(f"node a: gmijax {own['gmijax']}, Python")
     assert line.endswith("GPUs 2 x H200, clock +0.010 s")
     json.dumps(nodes_as_data(nodes))
+
+
+def test_a_node_that_is_lost_while_the_doctor_asks_it_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    closed: list[bool] = []
+    gone = RemoteNode(lambda *_: FakeAnswer(NodeLost("its raylet died")), 0, "10.0.0.1")
+    nodes = [NodeHandle(gone, Facts("10.0.0.1", machine(0), {}))]
+    cluster = SimpleNamespace(join=lambda *_: nodes, close=lambda: closed.append(True))
+    monkeypatch.setattr("gmijax.cluster.survey.RayCluster", lambda *_: cluster)
+    with pytest.raises(NodeLost, match=r"^node 0 \(10\.0\.0\.1\) is gone: .*its raylet died$"):
+        survey("auto")
+    assert closed
 
 
 def test_a_run_folder_that_a_node_does_not_see_is_refused(

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import threading
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -142,6 +144,22 @@ def test_a_job_that_fails_does_not_wait_for_films(tmp_path: Path):
         raise RuntimeError
     assert (said, run.film_log.exists()) == ([], False)
     assert list(run.videos.iterdir()) == []
+
+
+@pytest.mark.parametrize(("is_well", "waited"), [(True, "120 s"), (False, "5 s")])
+def test_a_film_that_is_given_up_is_told_with_how_long_it_was_waited_for(
+    is_well: bool, waited: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    said: list[str] = []
+    process = SimpleNamespace(tell=lambda _: None, end=lambda _: False)
+    monkeypatch.setattr("gmijax.control.films.SideProcess", lambda *_, **__: process)
+    with (
+        nullcontext() if is_well else pytest.raises(RuntimeError),
+        filmed("egl", RunPaths(tmp_path), said.append),
+    ):
+        if not is_well:
+            raise RuntimeError
+    assert said == [f"eval.video: the last film was given up after {waited}"]
 
 
 def test_what_cannot_be_drawn_is_one_line_and_no_error(tmp_path: Path):

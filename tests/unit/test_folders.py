@@ -13,7 +13,7 @@ from supervision import machine, planned
 
 from gmijax.cli.compose import compose
 from gmijax.control import serving
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, JobInterrupted
 from gmijax.runs.dataset import DataPaths, open_dataset
 from gmijax.runs.folder import add_event, read_json, write_json
 from gmijax.runs.held import locked
@@ -128,6 +128,38 @@ def test_an_interrupted_job_names_the_folder_of_its_shards_if_there_are_some(
     assert serving._what_is_left(job) == (
         "1 of 2 shards are in data; the same command makes the rest"
     )
+
+
+@pytest.mark.parametrize("was_there", [True, False])
+@pytest.mark.parametrize("others", [(), ("note.txt",)])
+def test_of_a_job_without_a_shard_its_own_files_go_from_the_folder(
+    was_there: bool, others: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    data = DataPaths(tmp_path / "data")
+    if was_there:
+        data.root.mkdir()
+        data.root.chmod(0o2770)
+    sizes = ("num_envs=4", "unroll_length=5", "num_timesteps=40")
+    config = compose("policy=random", "env=ant", *sizes, command="serve")
+    plan = planned(machine(0), backend="cpu")
+    job = serving._ServingJob(config, plan, machine(0), (0,), data, ())
+
+    def run(*_: object) -> None:
+        data.folder(0).mkdir()
+        data.shard(0, 0).arrays.write_bytes(b"half")
+        for name in others:
+            (data.root / name).touch()
+        raise JobInterrupted("interrupted")
+
+    monkeypatch.setattr(serving, "_prepared", lambda *_: job)
+    monkeypatch.setattr(serving, "_run", run)
+    with pytest.raises(JobInterrupted):
+        serving.serve(config)
+    assert data.root.exists() == bool(was_there or others)
+    if data.root.exists():
+        assert [path.name for path in data.root.iterdir()] == list(others)
+    assert not was_there or data.root.stat().st_mode & 0o7777 == 0o2770
 
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path: Path):

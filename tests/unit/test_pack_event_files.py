@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2
 
+from gmijax.packs import event_files
 from gmijax.packs.event_files import EventReader
 from gmijax.packs.output import OutputReader
 from gmijax.packs.progress import ProgressReader, own_patterns
@@ -74,6 +76,53 @@ def test_scalars_that_are_tensors_are_read(tmp_path: Path) -> None:
     whole = struct.pack("<Q", len(data)) + bytes(4) + data + bytes(4)
     (tmp_path / "events.out.tfevents.1").write_bytes(whole)
     assert EventReader(tmp_path, TAG, since_s=0.0).new() == [Report(steps=1.0, metric=4.0)]
+
+
+def record_of(step: int, value: float) -> bytes:
+    event = EVENT(step=step)
+    event.summary.value.add(tag=TAG, simple_value=value)
+    data = event.SerializeToString()
+    return struct.pack("<Q", len(data)) + bytes(4) + data + bytes(4)
+
+
+def test_a_long_record_is_passed_over_once_it_is_complete(tmp_path: Path) -> None:
+    """A logged film, for one."""
+    file, length = tmp_path / "events.out.tfevents.1", 20 << 20
+    file.write_bytes(record_of(1, 0.5) + struct.pack("<Q", length))
+    begins = file.stat().st_size
+    os.truncate(file, begins + length // 2)
+    reader = EventReader(tmp_path, TAG, since_s=0.0)
+    assert reader.new() == [Report(steps=1.0, metric=0.5)]
+    assert reader.new() == []
+    os.truncate(file, begins + 4 + length + 4)
+    with file.open("ab") as more:
+        more.write(record_of(2, 1.5))
+    assert reader.new() == [Report(steps=2.0, metric=1.5)]
+    assert reader.new() == []
+
+
+def test_many_records_are_read_in_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that a look stays short."""
+    monkeypatch.setattr(event_files, "_MOST_BYTES", 100)
+    file = tmp_path / "events.out.tfevents.1"
+    file.write_bytes(b"".join(record_of(step, 0.5) for step in range(1, 11)))
+    reader, found = EventReader(tmp_path, TAG, since_s=0.0), list[Report]()
+    turns = 0
+    while new := reader.new():
+        found += new
+        turns += 1
+    assert [report.steps for report in found] == list(range(1, 11))
+    assert turns > 1
+
+
+def test_a_damaged_file_is_not_read_on(tmp_path: Path) -> None:
+    clock, file = Clock(), tmp_path / "events.out.tfevents.1"
+    file.write_bytes(record_of(1, 0.5) + b"\xff" * 100)
+    reader = EventReader(tmp_path, TAG, 0.0, clock)
+    assert reader.new() == [Report(steps=1.0, metric=0.5)]
+    file.write_bytes(record_of(1, 0.5) + record_of(2, 1.5))
+    clock.now_s += 60.0
+    assert reader.new() == []
 
 
 def test_files_of_an_earlier_attempt_are_left_alone(tmp_path: Path, writer: EventsWriter) -> None:

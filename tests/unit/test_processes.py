@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+from gmijax.machine.interpreter import command
 from gmijax.machine.processes import (
     ProcessId,
     identify,
@@ -18,6 +21,7 @@ from gmijax.machine.processes import (
     that_have_open,
     wait_until_gone,
 )
+from gmijax.supervise.stop_signals import STOP_SIGNALS
 
 
 def test_zombie_is_not_running():
@@ -88,6 +92,22 @@ def test_what_a_group_has_started_is_found_in_groups_of_its_own():
             os.kill(one.pid, signal.SIGKILL)
         process.communicate()
     assert started_by(process.pid) == ()
+
+
+def test_a_janitor_ignores_what_asks_a_job_to_stop():
+    """Batch systems send that to all processes of a job."""
+    janitor = subprocess.Popen(command("gmijax.supervise.janitor"), stdin=subprocess.PIPE)
+    try:
+        status, mask = Path(f"/proc/{janitor.pid}/status"), 0
+        wanted = sum(1 << (number - 1) for number in STOP_SIGNALS)
+        deadline_s = time.monotonic() + 20.0
+        while mask & wanted != wanted and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+            mask = int(re.findall(r"SigIgn:\s*(\w+)", status.read_text())[0], 16)
+        assert mask & wanted == wanted
+    finally:
+        janitor.communicate()
+    assert janitor.returncode == 0
 
 
 def test_who_has_a_file_open(tmp_path: Path):

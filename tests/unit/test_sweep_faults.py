@@ -8,12 +8,14 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+from supervision import machine
 from test_sweep_nodes import Sweep, jobs
 
 from gmijax.cli.command import sweep_command
@@ -21,17 +23,19 @@ from gmijax.cli.compose import compose
 from gmijax.clock import running_s
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted, JobNotStarted
+from gmijax.machine.processes import identify
 from gmijax.runs.folder import read_json
 from gmijax.runs.held import OpenFolder, is_locked, locked, try_lock
+from gmijax.supervise import janitor
 from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps import held_jobs, report, scheduler
 from gmijax.sweeps.children import Child, Process
-from gmijax.sweeps.host import ChildStart
+from gmijax.sweeps.host import ChildStart, LocalHost
 from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.kind import JobStart
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.report import JobsReport
-from gmijax.sweeps.slots import Slot
+from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
 from gmijax.sweeps.study import Study
 from gmijax.sweeps.training import TrainingKind
 
@@ -191,6 +195,86 @@ def test_a_command_is_asked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         assert sent == [signal.SIGTERM]
     finally:
         child.close()
+
+
+WITHOUT_LOCK = (
+    *(sys.executable, "-ISc"),
+    "import os, time; os.closerange(3, 256); time.sleep(600)",
+)
+"""As `sudo` does."""
+
+
+@pytest.mark.parametrize("is_client", [True, False])
+def test_a_job_that_cannot_be_killed_is_named_and_holds_up_no_other(
+    is_client: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths, host, made = SweepPaths(tmp_path), LocalHost(machine(0)), list[Child]()
+    monkeypatch.setattr(
+        "gmijax.sweeps.host.Child", lambda *given: made.append(Child(*given)) or made[-1]
+    )
+    plan = plan_slots(SweepConfig(jobs_per_gpu=2), host.machine, {"auto"})
+    slots = SlotPool([Site(plan, host.machine)])
+    host.open(plan, paths)
+    of_both = jobs(2)
+    for number, job in enumerate(of_both):
+        lock, job.progress.attempts = paths.job(number).lock, 1
+        lock.parent.mkdir()
+        log = paths.job(number).root / "log"
+        process = Process("job", WITHOUT_LOCK, log, is_client=is_client, lock=lock)
+        slot = slots.acquire(1)
+        assert slot is not None
+        host.start(ChildStart(slot, process))
+        while is_locked(lock):
+            time.sleep(0.01)
+    pids = [child.pid for child in made]
+    try:
+        with monkeypatch.context() as patch:
+            for name in ("kill", "killpg"):
+                patch.setattr(os, name, forbidden(pids[0], getattr(os, name)))
+            patch.setattr("gmijax.sweeps.children._KILLED_S", 0.2)
+            host.order(1, "ask_to_stop")
+            host.close()
+        assert made[1].look().exit_code == -signal.SIGKILL
+        (said,) = held_jobs.left_behind(of_both, paths, host.left)
+        assert said.startswith(f"job 0: process {pids[0]} (")
+        assert said.endswith(f"still runs in its folder: end it (kill {pids[0]})")
+    finally:
+        for child in made:
+            child.kill()
+            while child.look().exit_code is None:
+                time.sleep(0.01)
+    assert held_jobs.left_behind(of_both, paths, host.left) == []
+
+
+def forbidden(pid: int, send: Callable[[int, int], None]) -> Callable[[int, int], None]:
+    """Sends signals to all but one process, which is as if it were another user's."""
+
+    def sent(to: int, number: int) -> None:
+        if to == pid:
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+        send(to, number)
+
+    return sent
+
+
+def test_a_group_that_cannot_be_killed_does_not_save_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    command = ("sleep", "600")
+    processes = [subprocess.Popen(command, start_new_session=True) for _ in range(2)]
+    known = [identify(process.pid) for process in processes]
+    groups = {process.pid: {process} for process in known if process is not None}
+    monkeypatch.setattr(janitor, "_DAEMON_ENDS_S", 0.2)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "killpg", forbidden(processes[0].pid, os.killpg))
+            janitor._kill(groups, ())
+        assert [process.wait(10) for process in processes[1:]] == [-signal.SIGKILL]
+        assert processes[0].poll() is None
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 def test_an_order_that_cannot_be_written_is_named(

@@ -114,6 +114,8 @@ class MpsBackend(Backend):
         if device in self._own and not self._own[device].is_answering():
             quit_daemon(self._own[device])
             self._start_daemon(device)
+        # Somebody else may have renewed theirs: what starts now is worth asking it once more.
+        self._unresponsive -= {device}
 
     def verify(self, pids: Mapping[int, int]) -> None:
         """Checks with the daemons that every GMI that is to be a client is one.
