@@ -36,7 +36,7 @@ from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import Job, jobs_of, placed, require_placeable, require_same, state_of
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.objective import require_logged, why_not_comparable, with_objective
-from gmijax.sweeps.packs import most_together, require_packable
+from gmijax.sweeps.packs import PackPlanner, most_together, require_packable
 from gmijax.sweeps.paths import ENV_PACK_DIR, SweepPaths
 from gmijax.sweeps.profile_jobs import profiled_job
 from gmijax.sweeps.progress import Progress
@@ -370,6 +370,19 @@ def test_playground_in_warp_is_not_packed() -> None:
     )
     assert most_together(SweepConfig(pack="auto"), in_warp[0], in_warp) == 1
     assert most_together(SweepConfig(pack="auto"), in_jax[0], in_jax) == 2
+
+
+@pytest.mark.parametrize(("sampler", "trials", "num"), [("grid", None, 3), ("random", 3, 1)])
+def test_jobs_of_a_sampler_are_not_packed(
+    sampler: Any, trials: int | None, num: int, tmp_path: Path
+) -> None:
+    settings = SweepConfig(pack="auto", sampler=sampler, trials=trials)
+    jobs = jobs_of([compose(f"algo.learning_rate={rate}") for rate in (1e-4, 3e-4, 1e-3)])
+    require_packable(settings, jobs)
+    assert most_together(settings, jobs[0], jobs) == num
+    # Those of a lost node wait together; a pruner ends each for itself.
+    planner = PackPlanner(settings, SweepPaths(tmp_path))
+    assert planner.together(jobs[0], jobs, ()) == jobs[:num]
 
 
 def test_too_many_jobs_for_the_machine_are_refused() -> None:
