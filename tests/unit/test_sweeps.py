@@ -17,6 +17,7 @@ import pytest
 from rich.console import Console
 from supervision import gpu, machine
 
+import gmijax
 from gmijax.autotune.grid import Measured, NotRunnable
 from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
@@ -114,6 +115,10 @@ def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
             "only with sweep.sampler=grid",
         ),
         (
+            ("sweep.sampler=tpe", "sweep.trials=3", "seed=1"),
+            "sweep.sampler=tpe: there is no list or interval to draw from; allowed: grid",
+        ),
+        (
             ("sweep.sampler=tpe", "sweep.trials=3", "algo.discounting=interval(0.9,2.5)"),
             "algo.discounting=2.5",
         ),
@@ -124,6 +129,15 @@ def test_bad_lists_are_refused(overrides: tuple[str, ...], said: str) -> None:
         build_sweep(overrides)
     assert said in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("trials", [1, 3])
+def test_configurations_are_nothing_to_draw_from(
+    trials: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr("gmijax.sweeps.sweep.run_work")  # Nothing is to be started.
+    with pytest.raises(ConfigError, match=r"^sweep\.sampler=random: .* allowed: grid$"):
+        gmijax.sweep([compose("seed=0"), compose("seed=1")], sampler="random", trials=trials)
 
 
 def test_configurations_differ_by_what_they_are_named() -> None:
