@@ -29,7 +29,7 @@ class Progress:
       reports: lines of metrics since it was started.
       num_timesteps: steps at its end, where its lines say them.
       value: what it is ranked by (`value_of`), None before there is one.
-      is_full: whether the value can be compared, see `Found`.
+      is_full: whether the value can be compared, see `ObjectiveValue`.
       episodes: how many the value is a mean over, where that is known.
       latest: the objective in the latest line that has it, over the short window.
       started_s: when this command started it the last time, by the monotonic clock.
