@@ -65,7 +65,7 @@ class TransferSize:
 
 
 class Compressor:
-    """Fills transfers with pieces, one transfer at a time; a `Packer`.
+    """Fills transfers with pieces, one transfer at a time; a `MessageEncoder`.
 
     `max_transfer_bytes` bounds the sum of all channels and versions.
     """

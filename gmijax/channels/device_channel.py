@@ -57,7 +57,7 @@ class DeviceWriter(PipeWriter):
 
 @dataclass
 class ResidentPacker:
-    """Leaves rollouts on the device; a `Packer`."""
+    """Leaves rollouts on the device; a `MessageEncoder`."""
 
     migrator: Migrator[DeviceWriter]
     sent: SentArrays

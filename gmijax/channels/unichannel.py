@@ -18,7 +18,7 @@ from gmijax.channels.pipe import Message
 
 
 class UniPacker:
-    """Takes the place of the compressor; a `Packer`."""
+    """Takes the place of the compressor; a `MessageEncoder`."""
 
     def __init__(self, migrator: Migrator) -> None:
         self._migrator = migrator

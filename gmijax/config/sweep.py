@@ -79,7 +79,7 @@ class SweepConfig(JobsConfig):
     pack: Literal["gmi", "vmap", "auto"] = doc(
         "how jobs share a GPU: each in processes of its own (gmi), those that differ in seed and "
         "learning rate alone as one program (vmap; only with sampler=grid), or as one where "
-        "possible (auto)",
+        "possible (auto; with another sampler as gmi)",
         default="gmi",
     )
     objective: str = doc(
@@ -88,6 +88,14 @@ class SweepConfig(JobsConfig):
         "return",
         default="auto",
     )
+
+    @property
+    def may_share_programs(self) -> bool:
+        """Whether jobs may be one program.
+
+        Not those of a sampler: it hands them out one at a time, and a pruner ends each for itself.
+        """
+        return self.pack != "gmi" and self.sampler == "grid"
 
     def _require_sampler(self) -> None:
         super()._require_sampler()

@@ -108,6 +108,7 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path) -> None:
         with recorded(gmis, lambda: "continue with the same sweep", record), progress:
             run_gmis(launch, on_tick)
         for member in members:
+            member.folder.require()
             console.print(train_outcome(read_json(member.run.summary), member.run))
 
 
@@ -138,9 +139,9 @@ def _prepare(members: Sequence[_Member], plan: Plan, gmis: RunPaths) -> None:
 
 def _record(members: Sequence[_Member], started_s: float, status: str, plan: Plan) -> None:
     wall_s = time.monotonic() - started_s
-    for config, run, _ in members:
-        if not run.config.exists():
-            continue  # Its folder is gone.
+    for config, run, folder in members:
+        if not folder.is_there():
+            continue  # What is at its path now is another run's.
         write_json(run.plan, plan.to_dict())
         record_end(config, plan, run, _status_of(run, status), wall_s, [])
 

@@ -123,9 +123,11 @@ def train_outcome(summary: Data, run: RunPaths) -> str:
         learnt = f"final return {mean:.2f} {EXPLORING}"
     checkpoint = summary["checkpoint"]
     where = "none" if checkpoint is None else nearby(Path(checkpoint))
+    # None where it ended in its first iteration.
+    steps = "no" if summary["env_steps"] is None else f"{summary['env_steps']:,}"
     curves = f"curves: {nearby(run.returns_png)}\n" if run.returns_png.exists() else ""
     return (
-        f"{summary['status']}: {summary['env_steps']:,} env steps in {clock(summary['wall_s'])}"
+        f"{summary['status']}: {steps} env steps in {clock(summary['wall_s'])}"
         f"{f', started again {times} times' if times else ''}\n{learnt}\n"
         f"{_of_rates(summary)}"
         f"{_of_evaluations(summary.get('eval'), run)}"

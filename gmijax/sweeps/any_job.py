@@ -61,9 +61,9 @@ def trainings_per_hour(jobs: Sequence[AnyJob]) -> float | None:
 
     None: it has not started any.
     """
-    run = [job.progress for job in jobs if job.progress.started_s is not None]
+    run = [job.progress for job in jobs if job.progress.first_started_s is not None]
     if not run:
         return None
-    first_s = min(progress.started_s or 0.0 for progress in run)
+    first_s = min(progress.first_started_s or 0.0 for progress in run)
     last_s = max(progress.ended_s or time.monotonic() for progress in run)
     return 3600 * sum(progress.state == "completed" for progress in run) / (last_s - first_s)

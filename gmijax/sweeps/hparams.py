@@ -14,7 +14,7 @@ def write_hparams(job: Job, run: RunPaths, objective: str) -> None:
     """Adds to the TensorBoard folder of a job that has ended, if it has a value.
 
     The objective is the scalar `hparam/<objective>`: the curves have tags of their own. One that
-    cannot be compared (`Found`) has a tag of its own too.
+    cannot be compared (`ObjectiveValue`) has a tag of its own too.
 
     Raises:
       OSError: it cannot be written.

@@ -33,7 +33,7 @@ class PackPlanner:
 
         Those of `alone`, numbers of jobs, are not put together with others.
         """
-        if self._settings.pack == "gmi" or why_alone(job) is not None:
+        if not self._settings.may_share_programs or why_alone(job) is not None:
             return (job,)
         is_alone, begin = job.number in alone, self._begin(job)
         if begin is None:
@@ -123,7 +123,7 @@ def may_share(one: Job, other: Job) -> bool:
 
 def most_together(settings: SweepConfig, job: Job, jobs: Sequence[Job]) -> int:
     """How many of the jobs of a sweep one program can train at most, of the kind of `job`."""
-    if settings.pack == "gmi" or why_alone(job) is not None:
+    if not settings.may_share_programs or why_alone(job) is not None:
         return 1
     return sum(may_share(job, other) for other in jobs)
 

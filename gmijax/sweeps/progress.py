@@ -29,10 +29,10 @@ class Progress:
       reports: lines of metrics since it was started.
       num_timesteps: steps at its end, where its lines say them.
       value: what it is ranked by (`value_of`), None before there is one.
-      is_full: whether the value can be compared, see `Found`.
+      is_full: whether the value can be compared, see `ObjectiveValue`.
       episodes: how many the value is a mean over, where that is known.
       latest: the objective in the latest line that has it, over the short window.
-      started_s: when this command started it, by the monotonic clock.
+      started_s: when this command started it the last time, by the monotonic clock.
       updated_s: when the first line of metrics came after that.
       reported_s: when the latest line of metrics came.
       ended_s: when it ended after that.
@@ -71,6 +71,7 @@ class Progress:
     error: str | None = None
     curve: list[tuple[int, float]] = field(default_factory=list)
     _first_steps: int = 0
+    _first_started_s: float | None = None
 
     @property
     def stage(self) -> tuple[State, int, str | None]:
@@ -78,8 +79,13 @@ class Progress:
         return self.state, self.attempts, self.note if self.state == "waiting" else None
 
     @property
+    def first_started_s(self) -> float | None:
+        """When this command started it the first time; None: it has not."""
+        return self.started_s if self._first_started_s is None else self._first_started_s
+
+    @property
     def wall_s(self) -> float:
-        """Seconds from its start to its end, or until now."""
+        """Seconds from its latest start to its end, or until now."""
         if self.started_s is None:
             return self.earlier_s
         return (self.ended_s or time.monotonic()) - self.started_s
@@ -112,6 +118,7 @@ class Progress:
         self.note, self.error = self.error, None  # Why it runs again, if it does.
         self.state, self.slot, self.node = "running", slot, node
         self.attempts += 1
+        self._first_started_s = self.first_started_s
         self.started_s, self.updated_s, self.ended_s = time.monotonic(), None, None
         self.reports, self.reported_s, self.exit_code = 0, None, None
 

@@ -135,7 +135,7 @@ class JobsReport:
 def _content(
     status: str, jobs: Sequence[AnyJob], ranking: Ranking, paths: SweepPaths, wall_s: float
 ) -> dict[str, Any]:
-    first_s = min((job.progress.started_s or math.inf for job in jobs), default=math.inf)
+    first_s = min((job.progress.first_started_s or math.inf for job in jobs), default=math.inf)
     rows = [_row(job, paths, first_s) for job in jobs]
     return {
         "status": status,

@@ -41,8 +41,8 @@ class Scheduler(Generic[J]):
     again, as often as their kind says.
 
     Args:
-      jobs: those that are known; those that are `waiting` are run. More come from the study.
-      study: see above; is told how jobs do.
+      jobs: those that are known; those that are `waiting` are run.
+      study: more jobs come from it; is told how jobs do.
       kind: of all jobs.
       ranking: what they are compared by.
       paths: their files.

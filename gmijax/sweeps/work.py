@@ -12,6 +12,7 @@ from rich.console import Console
 
 from gmijax.config import ClusterConfig
 from gmijax.config.sweep import JobsConfig, Ranking
+from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps.any_job import J
@@ -43,6 +44,9 @@ class Work(ABC, Generic[J]):
       cluster: the nodes that they run on; without an engine it is this machine.
       folder: of the command.
       words: the command line without its folder, empty where there is none.
+
+    Raises:
+      ConfigError: a sampler has nothing to draw from.
     """
 
     settings: JobsConfig
@@ -58,6 +62,13 @@ class Work(ABC, Generic[J]):
 
     resume_requirement: ClassVar[str]
     """In words, what must be the same where a command goes on."""
+
+    def __post_init__(self) -> None:
+        key, sampler = f"{self.settings.prefix}sampler", self.settings.sampler
+        if sampler != "grid" and not self.space:
+            raise ConfigError(
+                f"{key}={sampler}: there is no list or interval to draw from; allowed: grid"
+            )
 
     @property
     @abstractmethod

@@ -6,15 +6,23 @@ import errno
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
+from supervision import machine
 
+from gmijax.cli.compose import compose
+from gmijax.config.schema import to_dict
+from gmijax.control import packed
 from gmijax.errors import ConfigError, FolderLost
 from gmijax.learning.checkpoint import save_learner
+from gmijax.partition.planner import make_plan
+from gmijax.runs.checkpoints import UNFINISHED
 from gmijax.runs.folder import RunPaths, add_event, write_json
 from gmijax.runs.held import OpenFolder, locked
+from gmijax.runs.names import steps_name
 
 
 def replaced(folder: Path) -> None:
@@ -67,6 +75,26 @@ def test_a_folder_that_is_there_is_not_lost(tmp_path: Path, monkeypatch: pytest.
 
         monkeypatch.setattr(os, "stat", stat)
         held.require()
+
+
+def test_the_end_of_a_packed_run_is_not_that_of_another_run_in_its_place(tmp_path: Path):
+    config = compose()
+    plan = make_plan(config.plan, config.reduce, 64, machine(0))
+    runs = [RunPaths(tmp_path / name) for name in ("000", "001")]
+    with ExitStack() as held:
+        members: list[packed._Member] = []
+        for run in runs:
+            run.root.mkdir()
+            folder = held.enter_context(OpenFolder(run.root, "x"))
+            members.append(packed._Member(config, run, folder))
+        runs[0].root.rename(tmp_path / "moved")
+        being_saved = runs[0].checkpoints / f".{steps_name(64)}{UNFINISHED}"
+        being_saved.mkdir(parents=True)
+        for run in runs:
+            write_json(run.config, to_dict(config))
+        packed._record(members, 0.0, "failed", plan)
+    assert being_saved.exists()
+    assert [run.summary.exists() for run in runs] == [False, True]
 
 
 def test_nothing_makes_a_run_folder_anew_that_is_gone(tmp_path: Path):

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.text import Text
 from supervision import CHECKOUT, machine
 
+from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
 from gmijax.cli.pack import build_pack
 from gmijax.config import PlanConfig, ReduceConfig
@@ -24,7 +25,7 @@ from gmijax.control import phases, progress, time_left
 from gmijax.control.console import Show, announce, doing, nearby, open_console, print_next
 from gmijax.control.display import LiveDisplay
 from gmijax.control.progress import ConsoleProgress
-from gmijax.control.summary import next_steps, train_outcome
+from gmijax.control.summary import next_steps, train_outcome, train_summary
 from gmijax.control.time_left import TimeLeft
 from gmijax.deploy import playing
 from gmijax.errors import printable
@@ -134,6 +135,15 @@ def test_a_summary_has_the_rates_that_were_measured(
     told = train_outcome(summary, RunPaths(tmp_path)).splitlines()
     assert [text for text in told if "steps/s" in text] == [f"env steps/s: {line}"] * bool(line)
     assert told[:2] == ["completed: 10 env steps in 0:01", "no episode has ended"]
+
+
+def test_a_run_that_ended_in_its_first_iteration_says_so(tmp_path: Path):
+    run, config = RunPaths(tmp_path), compose()
+    plan = make_plan(config.plan, config.reduce, 64, machine(0))
+    summary = train_summary(config, plan, run, "failed", 1.0, [])
+    assert summary["env_steps"] is None
+    told = train_outcome(summary, run).splitlines()
+    assert told[:2] == ["failed: no env steps in 0:01", "no episode has ended"]
 
 
 def _told(lines: list[dict[str, Any]]) -> str:

@@ -149,6 +149,25 @@ def test_bad_input_is_refused(words: Sequence[str], command: Sequence[str], said
 
 
 @pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        (["pack.commands=commands"], []),
+        (["pack.copies=3"], ["true"]),
+        ([], ["true"]),
+    ],
+)
+def test_a_sampler_without_names_is_refused(
+    words: list[str], command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("commands").write_text("true\n")
+    with pytest.raises(ConfigError) as error:
+        build_pack([*words, "pack.sampler=random", "pack.trials=4"], command)
+    said = "pack.sampler=random: there is no list or interval to draw from; allowed: grid"
+    assert str(error.value) == said
+
+
+@pytest.mark.parametrize(
     ("argv", "said"),
     [
         (("--", "no-such-program"), "no-such-program: no such program"),

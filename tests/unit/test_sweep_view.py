@@ -8,6 +8,7 @@ import struct
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -279,3 +280,21 @@ def test_throughput_is_of_the_jobs_that_a_command_has_run(tmp_path: Path) -> Non
     assert [row["start_s"] for row in rows] == [0.0, 0.0, 0.0, None]
     assert rows[0]["wall_s"] == 1800.0
     assert rows[3]["wall_s"] == 0.0
+
+
+def test_throughput_counts_the_time_of_attempts_that_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = SimpleNamespace(now_s=50.0, monotonic=lambda: clock.now_s)
+    monkeypatch.setattr("gmijax.sweeps.progress.time", clock)
+    (job,) = jobs_of([compose()])
+    for _ in range(3):  # Each takes an hour; the last one is complete.
+        job.progress.begin("GPU 0 slot 0", None)
+        clock.now_s += 3600.0
+        job.progress.ended_s = clock.now_s
+    job.progress.state = "completed"
+    whole = JobsReport([job], SWEEP, dict, SweepPaths(tmp_path), OpenFolder(tmp_path, "x"), 0.0)
+    assert whole.end("completed") is None
+    assert whole.data["trainings_per_hour"] == pytest.approx(1 / 3)
+    (row,) = whole.data["jobs"]
+    assert (row["start_s"], row["wall_s"], row["attempts"]) == (7200.0, 3600.0, 3)

@@ -17,6 +17,7 @@ import pytest
 from rich.console import Console
 from supervision import gpu, machine
 
+import gmijax
 from gmijax.autotune.grid import Measured, NotRunnable
 from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
@@ -36,7 +37,7 @@ from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import Job, jobs_of, placed, require_placeable, require_same, state_of
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.objective import require_logged, why_not_comparable, with_objective
-from gmijax.sweeps.packs import most_together, require_packable
+from gmijax.sweeps.packs import PackPlanner, most_together, require_packable
 from gmijax.sweeps.paths import ENV_PACK_DIR, SweepPaths
 from gmijax.sweeps.profile_jobs import profiled_job
 from gmijax.sweeps.progress import Progress
@@ -114,6 +115,10 @@ def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
             "only with sweep.sampler=grid",
         ),
         (
+            ("sweep.sampler=tpe", "sweep.trials=3", "seed=1"),
+            "sweep.sampler=tpe: there is no list or interval to draw from; allowed: grid",
+        ),
+        (
             ("sweep.sampler=tpe", "sweep.trials=3", "algo.discounting=interval(0.9,2.5)"),
             "algo.discounting=2.5",
         ),
@@ -124,6 +129,15 @@ def test_bad_lists_are_refused(overrides: tuple[str, ...], said: str) -> None:
         build_sweep(overrides)
     assert said in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("trials", [1, 3])
+def test_configurations_are_nothing_to_draw_from(
+    trials: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr("gmijax.sweeps.sweep.run_work")  # Nothing is to be started.
+    with pytest.raises(ConfigError, match=r"^sweep\.sampler=random: .* allowed: grid$"):
+        gmijax.sweep([compose("seed=0"), compose("seed=1")], sampler="random", trials=trials)
 
 
 def test_configurations_differ_by_what_they_are_named() -> None:
@@ -370,6 +384,19 @@ def test_playground_in_warp_is_not_packed() -> None:
     )
     assert most_together(SweepConfig(pack="auto"), in_warp[0], in_warp) == 1
     assert most_together(SweepConfig(pack="auto"), in_jax[0], in_jax) == 2
+
+
+@pytest.mark.parametrize(("sampler", "trials", "num"), [("grid", None, 3), ("random", 3, 1)])
+def test_jobs_of_a_sampler_are_not_packed(
+    sampler: Any, trials: int | None, num: int, tmp_path: Path
+) -> None:
+    settings = SweepConfig(pack="auto", sampler=sampler, trials=trials)
+    jobs = jobs_of([compose(f"algo.learning_rate={rate}") for rate in (1e-4, 3e-4, 1e-3)])
+    require_packable(settings, jobs)
+    assert most_together(settings, jobs[0], jobs) == num
+    # Those of a lost node wait together; a pruner ends each for itself.
+    planner = PackPlanner(settings, SweepPaths(tmp_path))
+    assert planner.together(jobs[0], jobs, ()) == jobs[:num]
 
 
 def test_too_many_jobs_for_the_machine_are_refused() -> None:
