@@ -13,8 +13,9 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gmijax.config import PhysicsConfig, TrainConfig
 from gmijax.config.schema import to_dict
@@ -96,7 +97,7 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path) -> None:
             variables={MEMBERS_VARIABLE: roots},
             on_warning=console.print,
         )
-        new = MetricsReader(members[0].run.metrics).new
+        new = partial(_new_lines, [MetricsReader(member.run.metrics) for member in members])
         progress = ConsoleProgress(console, new, config.num_timesteps)
 
         def on_tick(status: tuple[GmiStatus, ...]) -> None:
@@ -135,6 +136,12 @@ def _prepare(members: Sequence[_Member], plan: Plan, gmis: RunPaths) -> None:
         write_json(run.config, to_dict(config))
         write_json(run.plan, plan.to_dict())
         add_event(run.events, "start", checkpoint=config.run.resume, gmi=str(gmis.gmi(0).root))
+
+
+def _new_lines(readers: Sequence[MetricsReader]) -> list[dict[str, Any]]:
+    """Metrics of all runs, the latest last: one that has diverged writes no more."""
+    found = [line for reader in readers for line in reader.new()]
+    return sorted(found, key=itemgetter("env_steps"))
 
 
 def _record(members: Sequence[_Member], started_s: float, status: str, plan: Plan) -> None:

@@ -211,7 +211,7 @@ class CommandKind:
         return JobOutcome(
             error=why.error,
             is_fault=True,
-            may_be_anothers=alone,
+            may_be_neighbours=alone,
             again=again,
             is_out_of_memory=why.is_out_of_memory,
         )

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from gmijax.supervise.failures import last_lines, last_of, may_be_anothers, signal_name
+from gmijax.supervise.failures import last_lines, last_of, may_be_neighbours, signal_name
 
 _TAIL_BYTES: Final = 1 << 16
 _TAIL_LINES: Final = 200
@@ -58,4 +58,4 @@ def failure_of(exit_code: int, log: Path, begins: int = 0) -> Failure:
             return Failure(text, is_memory, not is_memory)
     last = last_of(lines)
     text = f"{how}: {last}" if last else how
-    return Failure(text, is_gpu_fault=may_be_anothers(text))
+    return Failure(text, is_gpu_fault=may_be_neighbours(text))

@@ -89,7 +89,7 @@ def locked(lock: Path, what: str) -> Iterator[OpenFolder]:
 @contextmanager
 def gone_if_unused(
     root: Path,
-    is_empty: Callable[[], bool] = lambda: True,
+    is_empty: Callable[[], bool],
     remove: Callable[[Path], None] = lambda root: shutil.rmtree(root, ignore_errors=True),
 ) -> Iterator[None]:
     """Removes a folder that a job made, if it is refused or interrupted before it holds anything.

@@ -88,7 +88,7 @@ def first_cause(failures: Sequence[GmiFailed]) -> GmiFailed:
     )
 
 
-def may_be_anothers(reason: str) -> bool:
+def may_be_neighbours(reason: str) -> bool:
     """Whether the fault can be that of another client of the same MPS daemon.
 
     A fatal fault of one client ends all clients on its GPU, and CUDA does not say whose it was

@@ -30,7 +30,7 @@ class JobOutcome(NamedTuple):
       is_fault: whether it may be tried again: its machine is gone, its controller was killed, or
         the process that it shared with others is. From other faults a job with processes of its
         own goes on by itself.
-      may_be_anothers: whether a neighbour on its GPU may have caused it.
+      may_be_neighbours: whether a neighbour on its GPU may have caused it.
       is_out_of_memory: whether it found no memory on its GPU.
       again: why it is to be tried again without being counted; None: it is not.
     """
@@ -38,7 +38,7 @@ class JobOutcome(NamedTuple):
     is_interrupted: bool = False
     error: str | None = None
     is_fault: bool = False
-    may_be_anothers: bool = False
+    may_be_neighbours: bool = False
     is_out_of_memory: bool = False
     again: str | None = None
 

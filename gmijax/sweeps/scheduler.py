@@ -282,7 +282,7 @@ class Scheduler(Generic[J]):
         if end.is_out_of_memory and self._limiter and self._limiter.forbid(running, error):
             return f"again, beside fewer others, after {error}"
         # The fault may be that of another client of its daemon.
-        if end.may_be_anothers and is_shared and running.host.lost is None:
+        if end.may_be_neighbours and is_shared and running.host.lost is None:
             self._alone.add(job.number)
             return f"again, alone on its GPU, after {error}"
         if end.again is not None:

@@ -12,7 +12,7 @@ from gmijax.control.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from gmijax.machine.interpreter import command
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.history import MetricsReader
-from gmijax.supervise.failures import may_be_anothers, signal_name
+from gmijax.supervise.failures import may_be_neighbours, signal_name
 from gmijax.sweeps.children import ChildStatus, Process
 from gmijax.sweeps.hparams import write_hparams
 from gmijax.sweeps.jobs import Job, placed
@@ -105,9 +105,9 @@ class TrainingKind:
     def _failed(
         self, running: Running[Job], job: Job, error: str, *, is_fault: bool = False
     ) -> JobOutcome:
-        others = running.slot.backend in _ENDED_BY_GPU and may_be_anothers(error)
+        others = running.slot.backend in _ENDED_BY_GPU and may_be_neighbours(error)
         again = others and self.max_restarts(job) > 0
-        return JobOutcome(error=error, is_fault=is_fault, may_be_anothers=again)
+        return JobOutcome(error=error, is_fault=is_fault, may_be_neighbours=again)
 
     def max_restarts(self, job: Job) -> int:
         """See `Kind`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from gmijax.partition.planner import make_plan
 from gmijax.runs.checkpoints import UNFINISHED
 from gmijax.runs.folder import RunPaths, add_event, write_json
 from gmijax.runs.held import OpenFolder, locked
+from gmijax.runs.history import MetricsReader
 from gmijax.runs.names import steps_name
 
 
@@ -75,6 +77,17 @@ def test_a_folder_that_is_there_is_not_lost(tmp_path: Path, monkeypatch: pytest.
 
         monkeypatch.setattr(os, "stat", stat)
         held.require()
+
+
+def test_the_progress_of_packed_runs_goes_on_without_one_that_has_diverged(tmp_path: Path):
+    runs = [RunPaths(tmp_path / str(number)) for number in range(2)]
+    readers = [MetricsReader(run.metrics) for run in runs]
+    for run, last in zip(runs, (10, 30), strict=True):
+        run.root.mkdir()
+        lines = [json.dumps({"env_steps": steps}) for steps in range(10, last + 1, 10)]
+        run.metrics.write_text("\n".join((*lines, "")))
+    steps = [line["env_steps"] for line in packed._new_lines(readers)]
+    assert steps == [10, 10, 20, 30]
 
 
 def test_the_end_of_a_packed_run_is_not_that_of_another_run_in_its_place(tmp_path: Path):

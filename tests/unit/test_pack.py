@@ -380,10 +380,10 @@ def test_of_jobs_that_a_gpu_fault_ended_the_first_runs_alone(kind: CommandKind) 
         return kind.outcome(Running((job,), slot, host, 0, ()), job)
 
     ends = [fail(job) for job in work.jobs[:3]]
-    assert [end.may_be_anothers for end in ends] == [True, False, False]
+    assert [end.may_be_neighbours for end in ends] == [True, False, False]
     assert [end.again is None for end in ends] == [True, False, False]
-    assert not fail(work.jobs[2]).may_be_anothers
-    assert fail(work.jobs[2]).may_be_anothers  # It has been near too often.
+    assert not fail(work.jobs[2]).may_be_neighbours
+    assert fail(work.jobs[2]).may_be_neighbours  # It has been near too often.
 
 
 def test_a_job_that_finds_no_checkpoint_starts_from_its_beginning(

@@ -28,7 +28,7 @@ from gmijax.control.console import open_console
 from gmijax.errors import ConfigError, JobInterrupted
 from gmijax.runs.folder import read_json, write_json
 from gmijax.runs.held import OpenFolder, is_locked, locked
-from gmijax.supervise.failures import may_be_anothers
+from gmijax.supervise.failures import may_be_neighbours
 from gmijax.supervise.stop_signals import StopSignals
 from gmijax.sweeps import curve_window, jobs_per_gpu, runner
 from gmijax.sweeps.by_setting import name_of_middle, seed_summary
@@ -305,8 +305,8 @@ def test_a_job_alone_has_all_slots_of_its_gpu() -> None:
         ("ended by SIGKILL: not killed by gmijax; perhaps the machine ran out of memory", False),
     ],
 )
-def test_a_fault_of_the_gpu_may_be_anothers(reason: str, expected: bool) -> None:
-    assert may_be_anothers(f"GMI 0 failed: {reason}") == expected
+def test_a_fault_of_the_gpu_may_be_a_neighbours(reason: str, expected: bool) -> None:
+    assert may_be_neighbours(f"GMI 0 failed: {reason}") == expected
 
 
 @pytest.mark.parametrize(
