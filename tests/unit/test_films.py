@@ -147,11 +147,11 @@ def test_a_job_that_fails_does_not_wait_for_films(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("is_well", "waited"), [(True, "120 s"), (False, "5 s")])
-def test_a_film_that_is_given_up_is_told_with_how_long_it_was_waited_for(
+def test_a_film_that_is_given_up_is_named_with_the_seconds_of_the_wait(
     is_well: bool, waited: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     said: list[str] = []
-    process = SimpleNamespace(tell=lambda _: None, end=lambda _: False)
+    process = SimpleNamespace(send=lambda _: None, end=lambda _: False)
     monkeypatch.setattr("gmijax.control.films.SideProcess", lambda *_, **__: process)
     with (
         nullcontext() if is_well else pytest.raises(RuntimeError),
