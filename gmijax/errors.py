@@ -48,9 +48,9 @@ def lines_of(error: BaseException) -> list[str]:
     return [line for line in lines if line] or [type(error).__name__]
 
 
-def with_type(kind: str, said: str) -> str:
-    """`ValueError: said`; the type's name alone where an error says nothing."""
-    return f"{kind}: {said}" if said else kind
+def with_type(kind: str, message: str) -> str:
+    """`ValueError: message`; the type's name alone where an error says nothing."""
+    return f"{kind}: {message}" if message else kind
 
 
 class GmijaxError(Exception):

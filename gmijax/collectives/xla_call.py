@@ -165,8 +165,8 @@ def _stream(frame: Any) -> int:
     return asked.stream or 0
 
 
-def _error(frame: Any, said: str) -> int:
+def _error(frame: Any, message: str) -> int:
     asked = _ErrorArguments(
-        ctypes.sizeof(_ErrorArguments), None, said.encode(errors="replace"), _INTERNAL_ERROR
+        ctypes.sizeof(_ErrorArguments), None, message.encode(errors="replace"), _INTERNAL_ERROR
     )
     return frame.api.contents.create_error(asked)

@@ -55,10 +55,10 @@ class OpenGl(NamedTuple):
 def find_opengl_here() -> OpenGl:
     """Draws a small picture with each OpenGL until one can, each in a process of its own."""
     tried = opengls("egl", "osmesa")
-    gl, said = first_opengl(tried, OPENGL_TIMEOUT_S)
+    gl, message = first_opengl(tried, OPENGL_TIMEOUT_S)
     if gl is not None:
         return OpenGl(gl)
-    return OpenGl(None, f"{what_is_missing(tried)}; the last one: {said}")
+    return OpenGl(None, f"{what_is_missing(tried)}; the last one: {message}")
 
 
 def features(versions: Mapping[str, str | None], opengl: OpenGl | None) -> Iterator[Feature]:

@@ -37,11 +37,11 @@ def find_opengl(config: TrainConfig) -> str | None:
     if not config.eval.video:
         return None
     tried = opengls("osmesa", "egl")
-    gl, said = first_opengl(tried)
+    gl, message = first_opengl(tried)
     if gl is not None:
         return gl
     raise ConfigError(
-        f"eval.video={config.eval.video}: {what_is_missing(tried)}; the last one: {said}; "
+        f"eval.video={config.eval.video}: {what_is_missing(tried)}; the last one: {message}; "
         "without it, use eval.video=false"
     )
 

@@ -84,8 +84,8 @@ def film(
 
 def _why(exit_code: int, paths: PlayPaths) -> str:
     ended = f"the renderer was ended by {signal_name(-exit_code)}" if exit_code < 0 else ""
-    said = last_line(paths.render_log)
-    return f"{': '.join(filter(None, (ended, said)))} (log: {nearby(paths.render_log)})"
+    message = last_line(paths.render_log)
+    return f"{': '.join(filter(None, (ended, message)))} (log: {nearby(paths.render_log)})"
 
 
 def render(gl: str, paths: PlayPaths, seconds: float | None = None) -> int:

@@ -76,8 +76,8 @@ class MpsControl:
         except (OSError, subprocess.TimeoutExpired) as error:
             raise BackendUnavailable(f"cannot start {self.program} -d: {error}") from error
         if code:
-            said = messages.read_text(errors="replace").strip().replace("\n", "; ")
-            raise BackendUnavailable(f"{self.program} -d failed with exit code {code}: {said}")
+            message = messages.read_text(errors="replace").strip().replace("\n", "; ")
+            raise BackendUnavailable(f"{self.program} -d failed with exit code {code}: {message}")
 
     def is_answering(self) -> bool:
         """Whether a daemon listens."""
@@ -135,8 +135,8 @@ class MpsControl:
         except (OSError, subprocess.TimeoutExpired) as error:
             raise BackendUnavailable(f"MPS daemon in {self.pipe_directory}: {error}") from error
         if done.returncode:
-            said = (done.stdout + done.stderr).strip().replace("\n", "; ")
-            raise BackendUnavailable(f"MPS daemon in {self.pipe_directory}, {command}: {said}")
+            message = (done.stdout + done.stderr).strip().replace("\n", "; ")
+            raise BackendUnavailable(f"MPS daemon in {self.pipe_directory}, {command}: {message}")
         return done.stdout
 
     def _environment(self, more: Mapping[str, str]) -> dict[str, str]:

@@ -36,11 +36,11 @@ def environment_with(gl: str) -> dict[str, str]:
 
 
 def first_opengl(tried: Sequence[str], timeout_s: float | None = None) -> tuple[str | None, str]:
-    """The first of `tried` that draws here, None for none; and what the last one said.
+    """The first of `tried` that draws here, None for none; and the message of the last one.
 
     One that takes longer than `timeout_s` for a picture does not draw.
     """
-    said = ""
+    message = ""
     for gl in tried:
         try:
             done = subprocess.run(
@@ -54,12 +54,12 @@ def first_opengl(tried: Sequence[str], timeout_s: float | None = None) -> tuple[
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            said = f"no picture within {timeout_s:g} s"
+            message = f"no picture within {timeout_s:g} s"
             continue
         if done.returncode == 0:
             return gl, ""
-        said = next(iter(done.stderr.strip().splitlines()), f"exit code {done.returncode}")
-    return None, printable(said)
+        message = next(iter(done.stderr.strip().splitlines()), f"exit code {done.returncode}")
+    return None, printable(message)
 
 
 def why_no_opengl() -> str | None:
@@ -69,9 +69,9 @@ def why_no_opengl() -> str | None:
             return None
         return "mujoco was imported before; set MUJOCO_GL=egl (or osmesa) before Python starts"
     tried = opengls("egl", "osmesa")
-    gl, said = first_opengl(tried)
+    gl, message = first_opengl(tried)
     if gl is None:
-        return f"{what_is_missing(tried)}; the last one: {said}"
+        return f"{what_is_missing(tried)}; the last one: {message}"
     os.environ[GL_VARIABLE] = gl
     os.environ.pop("PYOPENGL_PLATFORM", None)
     return None

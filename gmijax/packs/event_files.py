@@ -21,7 +21,7 @@ _CHECK: Final = 4  # Bytes of a checksum: one after the length, one after the da
 _MOST_BYTES: Final = 1 << 24
 """Of one look, which must stay short. A longer record, such as a film, has no scalar."""
 _LONGEST_BYTES: Final = 1 << 31
-"""Of one record, as of any protobuf message. A file that tells of more is damaged."""
+"""Of one record, as of any protobuf message. A file with a longer one is damaged."""
 _DAMAGED: Final = 1 << 63
 """In place of where to read on: further than any file is long."""
 

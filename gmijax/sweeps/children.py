@@ -154,7 +154,7 @@ class Child:
         if self._is_client:
             self.ask_to_stop()
             return
-        self._pipe.write(INTERRUPT_BYTE)  # No signal: it may have been told to ignore that one.
+        self._pipe.write(INTERRUPT_BYTE)  # No signal: it may have been made to ignore that one.
 
     def kill(self) -> None:
         """Ends it now, and its process group; GMIs end with their controller."""

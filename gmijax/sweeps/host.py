@@ -154,7 +154,7 @@ class LocalHost:
 
 
 def variables_of(slot: Slot, backend: Backend) -> dict[str, str]:
-    """What tells a job at a slot its GPUs, and the daemon of each; a dead daemon is renewed."""
+    """Variables of a job at a slot: its GPUs, and the daemon of each; a dead one is renewed."""
     if not slot.devices:
         return {}
     daemons: dict[str, str] = {}
@@ -169,7 +169,7 @@ def variables_of(slot: Slot, backend: Backend) -> dict[str, str]:
 def client_variables(
     slot: Slot, process: Process, backend: Backend, machine: Machine
 ) -> dict[str, str]:
-    """What tells a program of any kind its GPU, and its share of it; a dead daemon is renewed."""
+    """Variables of a program of any kind: its GPU, and its share; a dead daemon is renewed."""
     if not slot.devices:
         return {}
     allocation, device = slot.allocations[0], slot.devices[0]
@@ -183,7 +183,7 @@ def client_variables(
         variables["CUDA_DEVICE_ORDER"] = "PCI_BUS_ID"
         variables["CUDA_VISIBLE_DEVICES"] = device if gpu is None else str(gpu.index)
     if pipe := backend.daemons.get(device):
-        # It tells gmijax in a job of a pack its GPU's UUID, and to be an MPS client.
+        # gmijax in a job of a pack takes its GPU's UUID from it, and is an MPS client.
         variables[DAEMONS_VARIABLE] = json.dumps({device: str(pipe)})
     if slot.backend == "mps" and process.memory_fraction is not None and gpu is not None:
         variables[MEMORY_LIMIT_VARIABLE] = f"0={int(process.memory_fraction * gpu.memory_mib)}M"

@@ -55,7 +55,7 @@ def with_jobs_per_gpu(
       settings: of the sweep.
       jobs: of it, some of each kind.
       hosts: its machines; backends are not entered.
-      console: told what was found.
+      console: for what was found.
       signals: end it.
       scratch: folder for what is measured, which the first machine sees; None: a temporary one.
 

@@ -99,7 +99,7 @@ def why_alone(job: Job) -> str | None:
 
 
 def require_packable(settings: SweepConfig, jobs: Sequence[Job]) -> None:
-    """Refuses jobs that cannot share a program where they are told to.
+    """Refuses jobs that cannot share a program where they must.
 
     Raises:
       ConfigError: names the job and what stands in the way.

@@ -75,7 +75,7 @@ class Progress:
 
     @property
     def stage(self) -> tuple[State, int, str | None]:
-        """What is told whenever it changes: state, attempts, and what a job waits for."""
+        """What is reported whenever it changes: state, attempts, and what a job waits for."""
         return self.state, self.attempts, self.note if self.state == "waiting" else None
 
     @property

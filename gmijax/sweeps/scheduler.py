@@ -33,7 +33,7 @@ _FIRST_REPORT_S = 120.0
 
 
 class Scheduler(Generic[J]):
-    """Starts jobs where there is room, reads how far they are, and ends them when told to.
+    """Starts jobs where there is room, reads how far they are, and ends them on request.
 
     A job that fails, or cannot be started, ends alone. But where it shared an MPS daemon, and the
     fault may have been that of another client, it is run once more, from its last checkpoint and
@@ -42,7 +42,7 @@ class Scheduler(Generic[J]):
 
     Args:
       jobs: those that are known; those that are `waiting` are run.
-      study: more jobs come from it; is told how jobs do.
+      study: more jobs come from it; gets how jobs do.
       kind: of all jobs.
       ranking: what they are compared by.
       paths: their files.

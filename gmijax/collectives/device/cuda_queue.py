@@ -125,8 +125,8 @@ def checked(result: tuple[Any, ...], wish: str) -> tuple[Any, ...]:
     """
     code, *values = result
     if code != runtime.cudaError_t.cudaSuccess:
-        said = runtime.cudaGetErrorString(code)[1].decode()
-        raise CudaError(f"cannot {wish}: {code.name}: {said}")
+        message = runtime.cudaGetErrorString(code)[1].decode()
+        raise CudaError(f"cannot {wish}: {code.name}: {message}")
     return tuple(values)
 
 

@@ -105,8 +105,8 @@ def attempt(what: str, function: Callable[..., Any], *arguments: Any, **named: A
     except (Exception, SystemExit) as error:
         lines = str(error).strip().splitlines() or [""]
         found = f"; {_FOUND}" if isinstance(error, ModuleNotFoundError) else ""
-        said = with_type(type(error).__name__, lines[0])
-        raise ConfigError(f"{what} fails: {said}{_line_of(error)}{found}") from error
+        message = with_type(type(error).__name__, lines[0])
+        raise ConfigError(f"{what} fails: {message}{_line_of(error)}{found}") from error
 
 
 def _line_of(error: BaseException) -> str:
