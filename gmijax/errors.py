@@ -73,6 +73,10 @@ class NoCheckpointYet(ConfigError):
         self.run = run
 
 
+class MissingKey(ConfigError):
+    """A key that has no default is not given."""
+
+
 class DamagedFile(ConfigError):
     """A file of a run cannot be read, or is not what its name says.
 

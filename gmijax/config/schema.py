@@ -16,7 +16,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, MissingKey
 
 T = TypeVar("T")
 
@@ -117,7 +117,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
         if key not in hints:
             raise ConfigError(f"unknown key {path}{key}{suggestion(key, hints)}")
     if missing := [key for key in hints if key not in data and not _has_default(cls, key)]:
-        raise ConfigError(f"missing key {path}{missing[0]}")
+        raise MissingKey(f"missing key {path}{missing[0]}")
     given = {key: kind for key, kind in hints.items() if key in data}
     return cls(**{key: convert(kind, data[key], path + key) for key, kind in given.items()})
 

@@ -41,7 +41,7 @@ from gmijax.runs.folder import (
 )
 from gmijax.runs.held import OpenFolder, gone_if_unused, locked
 from gmijax.runs.history import MetricsReader, read_metrics
-from gmijax.runs.resume import choose_checkpoint, find_checkpoint, is_training
+from gmijax.runs.resume import choose_checkpoint, is_training
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import serving_kind
@@ -167,10 +167,8 @@ def _prepared(config: ServeConfig, console: Console) -> _ServingJob:
     require_new_run(None, config.run.name)  # Before a search, which takes minutes.
     if config.run.dir is not None and (notice := source.executed(config.env)):
         console.print(notice)
-    newer = ()
-    if config.run.dir == "last":
-        _, newer = choose_checkpoint(config.run.dir, "run.dir")
-    config, plan, machine, reasons = decide(_with_checkpoint(config), console)
+    config, passed_over = _with_checkpoint(config)
+    config, plan, machine, reasons = decide(config, console)
     data = None
     if config.output.dir is not None:
         data = DataPaths(Path(config.output.dir).resolve())
@@ -180,14 +178,17 @@ def _prepared(config: ServeConfig, console: Console) -> _ServingJob:
     assert group is not None
     if config.run.dir is not None and (unknown := left_out(Path(config.run.dir))):
         reasons = (*reasons, unknown)
-    return _ServingJob(config, plan, machine, group.gmis, data, (*reasons, *newer))
+    return _ServingJob(config, plan, machine, group.gmis, data, (*reasons, *passed_over))
 
 
-def _with_checkpoint(config: ServeConfig) -> ServeConfig:
-    """The configuration with `run.dir` as the path of a checkpoint, and the MJX that it wants."""
+def _with_checkpoint(config: ServeConfig) -> tuple[ServeConfig, tuple[str, ...]]:
+    """The configuration with `run.dir` as the path of a checkpoint, and the MJX that it wants.
+
+    And what was passed over for that checkpoint.
+    """
     if config.run.dir is None:
-        return config
-    checkpoint = find_checkpoint(config.run.dir, "run.dir")
+        return config, ()
+    checkpoint, passed_over = choose_checkpoint(config.run.dir, "run.dir")
     meta = CheckpointMeta.read(checkpoint)
     trained, _ = trained_config(checkpoint)  # What is broken shows here, and not in every GMI.
     if meta.env != config.env.label:
@@ -204,7 +205,7 @@ def _with_checkpoint(config: ServeConfig) -> ServeConfig:
         # A policy may depend on what it was trained with.
         physics = dataclasses.replace(physics, impl="jax")
     run = dataclasses.replace(config.run, dir=str(checkpoint))
-    return dataclasses.replace(config, run=run, physics=physics)
+    return dataclasses.replace(config, run=run, physics=physics), passed_over
 
 
 def _about(job: _ServingJob) -> dict[str, Any]:

@@ -118,7 +118,7 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
     if not run.config.exists():
         return StartPoint(run)
     saved = config_of_run(run)
-    env, algo = task_and_algorithm(saved)
+    env, algo = task_and_algorithm(saved, run)
     was, wanted = (env.label, algo.name), (config.env.label, config.algo.name)
     if was != wanted:
         raise ConfigError(
@@ -131,7 +131,7 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
             f"{shown}: {none_is_whole(found)}; to train anew, choose another folder or remove "
             f"{nearby(run.checkpoints)}"
         )
-    changes = differences(saved, config).values()
+    changes = differences(saved, config, run).values()
     notes = (*found.passed_over, *(f"changed since the run: {text}" for text in changes))
     if found.checkpoint is None:
         return StartPoint(run, notes=(*notes, *_begins_anew(run)))
@@ -224,7 +224,7 @@ def _require_fit(
     ):
         if have != want:
             raise ConfigError(f"run.resume={wanted}: checkpoint of {name} {have}, not {want}")
-    trained, algo = task_and_algorithm(saved)
+    trained, algo = task_and_algorithm(saved, RunPaths(checkpoint.parents[1]))
     for key in config.algo.fixed_keys:
         have, want = getattr(algo, key), getattr(config.algo, key)
         if have != want:

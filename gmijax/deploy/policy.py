@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import numpy.typing as npt
 from gmijax.deploy.sealed import unsealed
 from gmijax.errors import ConfigError, lines_of
 from gmijax.runs.folder import read_json
-from gmijax.runs.resume import find_checkpoint
+from gmijax.runs.resume import choose_checkpoint
 
 _Actions = npt.NDArray[np.float32]
 
@@ -65,7 +66,8 @@ class Policy:
 def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Loads a trained policy.
 
-    A file is a program that is run: load only those of people whom you trust.
+    A file is a program that is run: load only those of people whom you trust. A RuntimeWarning
+    names every damaged checkpoint that was passed over for an older one.
 
     Args:
       path: a run folder (its newest checkpoint), a checkpoint folder, `last`, or a file that
@@ -82,7 +84,10 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     kinds = {".onnx": _from_onnx, ".stablehlo": _from_stablehlo}
     kind = kinds.get(os.path.splitext(text)[1])
     if kind is None:
-        return _from_checkpoint(find_checkpoint(text, "path"))
+        checkpoint, passed_over = choose_checkpoint(text, "path")
+        for line in passed_over:
+            warnings.warn(line, RuntimeWarning, stacklevel=2)
+        return _from_checkpoint(checkpoint)
     if not os.path.isfile(text):  # Unlike `Path.is_file` it takes any text.
         raise ConfigError(f"path={text}: no such file")
     return kind(Path(text))

@@ -15,8 +15,13 @@ from gmijax.errors import ConfigError
 from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of
 from gmijax.runs.folder import META, RunPaths, remove_temporary, write_json
 from gmijax.runs.names import nearby, steps_name
-from gmijax.runs.ranking import best_checkpoint, ranked
-from gmijax.runs.resume import find_checkpoint, first_checkpoint_of, newer_than, unsaved_runs
+from gmijax.runs.ranking import choose_best, ranked
+from gmijax.runs.resume import (
+    choose_checkpoint,
+    find_checkpoint,
+    first_checkpoint_of,
+    unsaved_runs,
+)
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
 from gmijax.sim.registry import require_env, require_own
@@ -46,7 +51,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
             "" if isinstance(config, ExportConfig) else hint
         )
         raise ConfigError(f"env={config.run.env}: {why}")
-    checkpoint = checkpoint_of(config)
+    checkpoint, passed_over = checkpoint_of(config)
     early = None
     is_last = config.checkpoint in (None, "best") and config.run.dir in (None, "last")
     if config.checkpoint == "best" and not ranked([checkpoint])[0][0].is_full:
@@ -68,19 +73,22 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
         left_out(checkpoint),
         early,
         *(f"{run}: {first_checkpoint_of(run)}" for run in (unsaved_runs() if is_last else ())),
-        *(newer_than(checkpoint) if is_last else ()),
+        *passed_over,
     )
     return config, env, "\n".join(filter(None, notes)) or None
 
 
-def checkpoint_of(config: PlayConfig | ExportConfig | ViewConfig) -> Path:
-    """The checkpoint that the configuration names."""
+def checkpoint_of(config: PlayConfig | ExportConfig | ViewConfig) -> tuple[Path, tuple[str, ...]]:
+    """The checkpoint that the configuration names, and what was passed over for it."""
     wanted, run_dir = config.checkpoint, config.run.dir
     if wanted in (None, "best") or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):
-        latest = find_checkpoint(run_dir or "last", "run.dir")
-        if wanted == "best":
-            return best_checkpoint(latest.parents[1]) or latest
-        return latest if wanted is None else _at_step(latest.parents[1], int(wanted))
+        latest, passed_over = choose_checkpoint(run_dir or "last", "run.dir")
+        if wanted is None:
+            return latest, passed_over
+        if wanted != "best":  # Nothing else was meant.
+            return _at_step(latest.parents[1], int(wanted)), ()
+        best, better = choose_best(latest.parents[1])
+        return best or latest, tuple(dict.fromkeys((*passed_over, *better)))
     if not os.path.isfile(Path(wanted) / META):  # Unlike `Path.is_file` it takes any text.
         raise ConfigError(
             f"checkpoint={wanted}: expected the folder of a checkpoint, its env steps, or best"
@@ -92,7 +100,7 @@ def checkpoint_of(config: PlayConfig | ExportConfig | ViewConfig) -> Path:
             raise ConfigError(
                 f"checkpoint={wanted}: not of run.dir={run_dir}; leave out one of them"
             )
-    return checkpoint
+    return checkpoint, ()
 
 
 def _at_step(run: Path, env_steps: int) -> Path:

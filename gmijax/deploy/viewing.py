@@ -92,7 +92,8 @@ def opened_once_saved(
                 if not is_waiting:
                     require_packages()  # Rather now than after the wait.
                     # It is being trained, so it has a configuration.
-                    env, _ = task_and_algorithm(config_of_run(RunPaths(error.run)))
+                    run = RunPaths(error.run)
+                    env, _ = task_and_algorithm(config_of_run(run), run)
                     require_own(env)
                     waiting.enter_context(doing(console, f"waiting: {error}"))
                 is_waiting = True

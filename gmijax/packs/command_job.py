@@ -6,7 +6,8 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from gmijax.runs.names import as_typed
 from gmijax.sweeps.any_job import label_of
 from gmijax.sweeps.paths import DIGITS
 from gmijax.sweeps.progress import Progress
+from gmijax.sweeps.space import MAX_JOBS
 
 
 @dataclass(frozen=True)
@@ -79,21 +81,20 @@ def jobs_of_file(settings: PackConfig) -> tuple[CommandJob, ...]:
     """A job for every line of `pack.commands`; `#` begins a comment.
 
     Raises:
-      ConfigError: the file cannot be read, or a line of it.
+      ConfigError: the file cannot be read, or a line of it, or it has too many.
     """
     path = str(settings.commands)
-    try:
-        text = sys.stdin.read() if path == "-" else Path(path).expanduser().read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "is not text"
-        raise ConfigError(f"pack.commands={path}: cannot be read ({why})") from None
     jobs: list[CommandJob] = []
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(_lines_of(path), 1):
         try:
             words = shlex.split(line, comments=True)
             require_names([*words, *templates_of(settings)], {})
         except (ValueError, ConfigError) as error:
             raise ConfigError(f"pack.commands={path}: line {number}: {error}") from None
+        if words and len(jobs) == MAX_JOBS:
+            raise ConfigError(
+                f"pack.commands={path}: line {number}: at most {MAX_JOBS:,} jobs are allowed"
+            )
         if words:
             name = {"command": shlex.join(words)}
             words[0] = absolute(words[0])
@@ -102,6 +103,16 @@ def jobs_of_file(settings: PackConfig) -> tuple[CommandJob, ...]:
     if not jobs:
         raise ConfigError(f"pack.commands={path}: holds no command")
     return tuple(jobs)
+
+
+def _lines_of(path: str) -> Iterator[str]:
+    """The lines of a file one by one: the standard input may have no end."""
+    try:
+        with nullcontext(sys.stdin) if path == "-" else Path(path).expanduser().open() as file:
+            yield from file
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "is not text"
+        raise ConfigError(f"pack.commands={path}: cannot be read ({why})") from None
 
 
 def templates_of(settings: PackConfig) -> list[str]:

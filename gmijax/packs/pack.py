@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 import typing
 from collections.abc import Iterable, Mapping, Sequence
@@ -36,7 +37,7 @@ from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.progress import State
 from gmijax.sweeps.runner import SweepResult, run_work
 from gmijax.sweeps.slots import Site, Slot, SlotPool, plan_slots
-from gmijax.sweeps.space import Choices, Interval, Space, corners, grid
+from gmijax.sweeps.space import MAX_JOBS, Choices, Interval, Space, corners, grid, require_few_jobs
 from gmijax.sweeps.work import Folder, Work
 
 _MOST_SHOWN = 4
@@ -247,6 +248,7 @@ def pack_of(
         raise ConfigError(f"{empty[0]}: an empty list")
     points = grid(space, "pack") if settings.sampler == "grid" else corners(space)
     if settings.copies is not None:
+        require_few_jobs("pack.copies", settings.copies)
         points = [{}] * settings.copies
     jobs = tuple(make_job(number, point) for number, point in enumerate(points))
     return PackWork(settings, space, make_job, jobs, nodes, folder)
@@ -279,16 +281,20 @@ def pack(
     command = _listed("command", command)
     if wrong := [word for word in command if not isinstance(word, str)]:
         raise ConfigError(f"command: {wrong[0]!r}: expected text")
-    lists = {key: _listed(key, values) for key, values in (grid or {}).items()}
+    lists = {key: _listed(key, values, MAX_JOBS) for key, values in (grid or {}).items()}
     space = {key: Choices(tuple(map(str, values))) for key, values in lists.items()}
     own = from_dict(PackConfig, settings)
     return run_work(pack_of(own, space, command, Folder(run_dir, None)), show=show)
 
 
-def _listed(key: str, values: Iterable[Any]) -> tuple[Any, ...]:
+def _listed(key: str, values: Iterable[Any], most: int | None = None) -> tuple[Any, ...]:
     if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
         raise ConfigError(f"{key}={values!r}: expected a list")
-    return tuple(values)
+    # One more shows that there are too many, also of a generator without an end.
+    found = tuple(values if most is None else itertools.islice(values, most + 1))
+    if most is not None and len(found) > most:
+        raise ConfigError(f"{key}: at most {most:,} values are allowed")
+    return found
 
 
 def _with_own_backends(said: str) -> str:

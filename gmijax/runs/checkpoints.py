@@ -97,9 +97,12 @@ class NewestCheckpoint(NamedTuple):
     @property
     def passed_over(self) -> tuple[str, ...]:
         """The broken ones, each in a sentence for the user."""
-        return tuple(
-            f"checkpoint {nearby(path)}: passed over, {wrong}" for path, wrong in self.broken
-        )
+        return tuple(passed_over(path, wrong) for path, wrong in self.broken)
+
+
+def passed_over(checkpoint: Path, wrong: str) -> str:
+    """Says that a checkpoint is not used, and what is wrong with it."""
+    return f"checkpoint {nearby(checkpoint)}: passed over, {wrong}"
 
 
 def checkpoints_of(folder: Path) -> list[Path]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmijax.errors import ConfigError
-from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of, what_is_broken
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of, passed_over, what_is_broken
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.history import number_in, read_metrics
 
@@ -42,11 +42,24 @@ def ranked(checkpoints: Sequence[Path]) -> list[tuple[Rank, Path]]:
 
 
 def best_checkpoint(folder: Path) -> Path | None:
-    """The best checkpoint of a run folder, see `ranked`, whose files are as they were written."""
+    """The best checkpoint of a run folder, see `choose_best`."""
+    return choose_best(folder)[0]
+
+
+def choose_best(folder: Path) -> tuple[Path | None, tuple[str, ...]]:
+    """The best checkpoint of a run folder, see `ranked`, whose files are as they were written.
+
+    And what was passed over for it: better ones, and those whose rank cannot be read.
+    """
+    best, named = None, list[str]()
     for _, path in ranked(checkpoints_of(folder)):
-        if what_is_broken(path) is None:
-            return path.resolve()
-    return None
+        if best is not None and _meta_of(path) is not None:
+            continue
+        if wrong := what_is_broken(path):
+            named.append(passed_over(path, wrong))
+        elif best is None:
+            best = path.resolve()
+    return best, tuple(named)
 
 
 def best_evaluation(folder: Path, env_steps: int) -> float:

@@ -25,7 +25,10 @@ _MOST_NAMED: Final = 5
 
 
 def find_checkpoint(wanted: str, key: str) -> Path:
-    """The checkpoint that `wanted` names, see `choose_checkpoint`."""
+    """The checkpoint that `wanted` names, see `choose_checkpoint`.
+
+    Where nobody reads what was passed over, or has read it before.
+    """
     return choose_checkpoint(wanted, key)[0]
 
 

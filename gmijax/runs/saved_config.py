@@ -11,7 +11,7 @@ from typing import Any, Final
 from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig, TrainConfig
 from gmijax.config.removed import REMOVED, without_removed
 from gmijax.config.schema import flatten, from_dict, from_named, known, to_dict
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, MissingKey
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.names import nearby
 from gmijax.runs.resume import any_checkpoint
@@ -96,22 +96,31 @@ def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
       ConfigError: the checkpoint does not lie in the folder of a training run, or its file has a
         wrong value of them.
     """
-    saved = saved_config(checkpoint)
-    try:
-        return task_and_algorithm(saved)
-    except ConfigError as error:
-        file = nearby(RunPaths(checkpoint.parents[1]).config)
-        raise ConfigError(f"{file}: {error}") from None
+    return task_and_algorithm(saved_config(checkpoint), RunPaths(checkpoint.parents[1]))
 
 
-def task_and_algorithm(saved: Mapping[str, Any]) -> tuple[EnvConfig, AlgoConfig]:
-    """Task and algorithm of a saved configuration.
+def task_and_algorithm(saved: Mapping[str, Any], run: RunPaths) -> tuple[EnvConfig, AlgoConfig]:
+    """Task and algorithm of the saved configuration of a run.
 
-    Keys that this version of gmijax does not know any more are left out.
+    Keys that this version of gmijax does not know any more are left out. A key with a default in
+    its class is as it was before there was such a key; of any other nobody knows what a run
+    without it did.
+
+    Raises:
+      ConfigError: names the run's file, and a key of it that is missing or has a wrong value.
     """
-    algo, _ = known(ALGORITHMS, saved["algo"], "algo.")
-    env, _ = known([EnvConfig], saved["env"], "env.")
-    return from_dict(EnvConfig, env, "env."), from_named(ALGORITHMS, algo, "algo.")
+    try:
+        algo, _ = known(ALGORITHMS, saved["algo"], "algo.")
+        env, _ = known([EnvConfig], saved["env"], "env.")
+        return from_dict(EnvConfig, env, "env."), from_named(ALGORITHMS, algo, "algo.")
+    except MissingKey as error:
+        raise ConfigError(
+            f"{nearby(run.config)}: {error}, as in a run of another version; add it to that file "
+            "with the value that the run was trained with (gmijax train env=TASK algo=NAME "
+            "--cfg job prints that of this version)"
+        ) from None
+    except ConfigError as error:
+        raise ConfigError(f"{nearby(run.config)}: {error}") from None
 
 
 def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
@@ -132,15 +141,19 @@ def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
         )
 
 
-def differences(saved: Mapping[str, Any], config: TrainConfig) -> dict[str, str]:
+def differences(saved: Mapping[str, Any], config: TrainConfig, run: RunPaths) -> dict[str, str]:
     """What a job does otherwise than a run, a sentence by key.
 
     Args:
       saved: the run's configuration. Keys of task and algorithm that its version did not have are
         as they were without.
       config: that of the job.
+      run: whose configuration it is.
+
+    Raises:
+      ConfigError: as `task_and_algorithm`.
     """
-    env, algo = task_and_algorithm(saved)
+    env, algo = task_and_algorithm(saved, run)
     whole = {**saved, "env": to_dict(env), "algo": to_dict(algo)}
     # As both are after a round trip through JSON.
     before, now = (flatten(json.loads(json.dumps(one))) for one in (whole, to_dict(config)))

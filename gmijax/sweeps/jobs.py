@@ -145,7 +145,7 @@ def require_same(run: RunPaths, config: TrainConfig) -> None:
     saved = config_of_run(run)
     changed = [
         text
-        for key, text in differences(saved, config).items()
+        for key, text in differences(saved, config, run).items()
         # In the run a teacher is the checkpoint that was found for what the user gave.
         if key.startswith(_LEARNT_WITH) and key != "algo.teacher"
     ]

@@ -51,9 +51,14 @@ def grid(space: Space, command: str = "sweep") -> list[dict[str, str]]:
                 "or give values"
             )
         lists[key] = values.values
-    if (count := math.prod(map(len, lists.values()))) > MAX_JOBS:
-        raise ConfigError(f"{' '.join(lists)}: {count:,} jobs; at most {MAX_JOBS:,} are allowed")
+    require_few_jobs(" ".join(lists), math.prod(map(len, lists.values())))
     return [dict(zip(lists, values, strict=True)) for values in itertools.product(*lists.values())]
+
+
+def require_few_jobs(keys: str, num_jobs: int) -> None:
+    """Raises ConfigError if `keys` ask for more jobs than `MAX_JOBS`; before a list is made."""
+    if num_jobs > MAX_JOBS:
+        raise ConfigError(f"{keys}: {num_jobs:,} jobs; at most {MAX_JOBS:,} are allowed")
 
 
 def corners(space: Space) -> list[dict[str, str]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gmijax.errors import ConfigError
 from gmijax.player.policy import PlainPolicy, checkpoint_policy
-from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of
+from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of, what_is_broken
 from gmijax.runs.folder import META, POLICY
 from gmijax.runs.names import steps_of
 
@@ -36,7 +36,9 @@ class Checkpoints:
 
 
 def read(checkpoint: Path) -> PlainPolicy | None:
-    """The policy of a checkpoint; None: it is gone, or no policy."""
+    """The policy of a checkpoint; None: it is gone, damaged, or no policy."""
+    if what_is_broken(checkpoint) is not None:  # As `gmijax view` passes it over at its start.
+        return None
     try:
         return checkpoint_policy(checkpoint)
     except ConfigError:

@@ -251,7 +251,7 @@ class Loop:
         """Acts by the policy of a checkpoint; False where it has none."""
         policy: Policy | None = checkpoints.read(checkpoint)
         if policy is None:  # The next look finds others.
-            self._change(problem=f"{checkpoints.label(checkpoint)}: gone, or no policy")
+            self._change(problem=f"{checkpoints.label(checkpoint)}: gone, damaged, or no policy")
             return False
         self._simulation.policy = policy
         self._change(checkpoint=checkpoint, problem="")

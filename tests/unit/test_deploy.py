@@ -23,7 +23,7 @@ from gmijax.deploy.trained import trained_policy
 from gmijax.errors import ConfigError
 from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
-from gmijax.runs.folder import ExportPaths, RunPaths
+from gmijax.runs.folder import META, ExportPaths, RunPaths
 from gmijax.sim.physics import PhysicsState
 from gmijax.sim.tasks import ball_balance
 from gmijax.supervise.start_gmi import environment_of
@@ -122,6 +122,17 @@ def test_a_path_without_a_policy_is_bad_input(tmp_path: Path, name: str, said: s
     with pytest.raises(ConfigError, match=f"^path=.*{said}") as error:
         gmijax.load_policy(tmp_path / name)
     assert len(str(error.value).splitlines()) == 1
+
+
+def test_a_damaged_checkpoint_that_is_passed_over_is_warned_of(run: RunPaths, tmp_path: Path):
+    shutil.copytree(run.root, tmp_path / "run")
+    paths = RunPaths(tmp_path / "run")
+    paths.checkpoint(ENV_STEPS + 1).mkdir()
+    (paths.checkpoint(ENV_STEPS + 1) / META).write_text("{")
+    with pytest.warns(RuntimeWarning, match=r": passed over, broken meta\.json") as warned:
+        policy = gmijax.load_policy(paths.root)
+    assert policy.metadata["env_steps"] == ENV_STEPS
+    assert [Path(one.filename).name for one in warned] == [Path(__file__).name]
 
 
 def test_a_checkpoint_that_holds_no_policy_is_bad_input(run: RunPaths, tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib.util
 import json
@@ -22,7 +23,7 @@ from gmijax.deploy import exporting, playing
 from gmijax.deploy.viewing import view
 from gmijax.errors import ConfigError
 from gmijax.runs.checkpoints import CheckpointMeta
-from gmijax.runs.folder import RunPaths, read_json, write_json
+from gmijax.runs.folder import META, RunPaths, read_json, write_json
 from gmijax.sim import source
 from gmijax.sim.adapters import custom
 from gmijax.sim.registry import make_env
@@ -94,6 +95,20 @@ def test_only_the_noted_file_or_one_that_is_named_is_executed(
     write_json(run.config, saved)
     with pytest.raises(ConfigError, match="may have changed since this run was trained"):
         opened(kind)
+
+
+@pytest.mark.parametrize("kind", ["play", "export", "serve", "resume"])
+def test_a_damaged_checkpoint_is_named_by_every_command(
+    kind: str, run: RunPaths, starts: None, capsys: pytest.CaptureFixture[str]
+):
+    Path("point.py").write_text("def make(): ...\n")
+    meta = CheckpointMeta.read(run.checkpoint(100))
+    newest = save_meta(run, dataclasses.replace(meta, env_steps=200))
+    (newest / META).write_text("{")
+    with pytest.raises(StartedError):
+        opened(kind)
+    said = "checkpoint theirs/checkpoints/000000000200: passed over, broken meta.json (not JSON"
+    assert said in capsys.readouterr().out
 
 
 def test_play_hands_its_child_the_file_that_it_looked_at(run: RunPaths, starts: None):

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import re
 import signal
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from command_lines import run
@@ -134,6 +135,7 @@ def test_keys_that_hold_text_need_no_quotes_of_hydra() -> None:
         (("pack.rate=fps",), ("true",), "pack.rate=fps: has 0 groups"),
         (("pack.rate=(",), ("true",), r"pack.rate=\(: no regular expression"),
         (("pack.copies=2", "seed=0,1"), COMMAND, "pack.copies: not with a grid"),
+        (("pack.copies=10001",), ("true",), "^pack.copies: 10,001 jobs; at most 10,000 are"),
         (("pack.commands=/nothing",), (), "pack.commands=/nothing: cannot be read"),
         (("pack.commands=/nothing", "seed=1"), (), "pack.commands: not with a grid"),
         (("pack.resume=--load {name}",), ("true",), r"\{name\}: no such placeholder"),
@@ -165,6 +167,21 @@ def test_a_sampler_without_names_is_refused(
         build_pack([*words, "pack.sampler=random", "pack.trials=4"], command)
     said = "pack.sampler=random: there is no list or interval to draw from; allowed: grid"
     assert str(error.value) == said
+
+
+def test_lists_that_are_too_long_are_not_read_to_their_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def seeds() -> Iterator[int]:
+        yield from range(10_001)
+        pytest.fail("read on")
+
+    monkeypatch.setattr("sys.stdin", io.StringIO("true\n" * 10_002))
+    said = "^pack.commands=-: line 10001: at most 10,000 jobs are allowed$"
+    with pytest.raises(ConfigError, match=said):
+        build_pack(["pack.commands=-"], [])
+    with pytest.raises(ConfigError, match=r"^seed: at most 10,000 values"):
+        gmijax.pack(COMMAND, {"seed": cast("Any", seeds())})
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,22 @@ def test_the_latest_checkpoint_is_played_unless_one_is_named(
         ((f"run.dir={run.root}", "checkpoint=best"), best),
         (("checkpoint=best",), best),
     ):
-        assert checkpoint_of(config_of(*overrides)) == expected
+        assert checkpoint_of(config_of(*overrides)) == (expected, ())
+
+
+def test_a_best_checkpoint_that_is_damaged_is_named(run: RunPaths):
+    """Also one whose rank cannot be read any more."""
+    named = f"run.dir={run.root}", "checkpoint=best"
+    meta = dataclasses.replace(CheckpointMeta.read(run.checkpoint(100)), eval_return=-3.0)
+    damaged = {"files": {"learner": (1, 2)}}
+    for env_steps, more in ((100, {}), (200, {}), (300, {"eval_return": -1.0} | damaged)):
+        save_meta(run, dataclasses.replace(meta, env_steps=env_steps, **more))
+    (run.checkpoint(200) / META).write_text("{")
+    (run.checkpoint(2000) / META).write_text("{")
+    checkpoint, passed_over = checkpoint_of(config_of(*named))
+    assert checkpoint == run.checkpoint(100)
+    starts = [line.partition(": passed over, ")[0][-12:] for line in passed_over]
+    assert sorted(starts) == [f"{steps:012d}" for steps in (200, 300, 2000)]
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def other(run: RunPaths) -> object:
 
 
 def at_step_7(run: RunPaths) -> object:
-    return checkpoint_of(build("play", PlayConfig, [f"run.dir={run.root}", "checkpoint=7"]))
+    return checkpoint_of(build("play", PlayConfig, [f"run.dir={run.root}", "checkpoint=7"]))[0]
 
 
 def written_to(run: RunPaths) -> object:

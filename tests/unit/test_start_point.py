@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,6 +28,7 @@ from gmijax.errors import ConfigError
 from gmijax.runs.checkpoints import CheckpointMeta
 from gmijax.runs.folder import META, RunPaths, create_run, read_json, write_json
 from gmijax.runs.history import read_metrics
+from gmijax.runs.saved_config import trained_config
 
 
 def config_of(folder: Path, *overrides: str) -> TrainConfig:
@@ -410,6 +412,36 @@ def test_auto_fills_in_what_an_older_version_did_not_save(run: RunPaths):
     assert isinstance(wanted.algo, PpoConfig)
     assert config.algo.clipping_epsilon == wanted.algo.clipping_epsilon
     assert config.eval == wanted.eval
+
+
+@pytest.mark.parametrize("override", ["num_envs=8", "algo.clip_value_loss=true"])
+def test_a_key_that_a_run_lacks_is_named_with_its_file(
+    run: RunPaths, override: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(run.root.parent)
+    saved = read_json(run.config)
+    del saved["algo"]["clip_value_loss"]
+    write_json(run.config, saved)
+    save(run, 100)
+    said = (
+        "^run/config.json: missing key algo.clip_value_loss, as in a run of another version; add "
+        "it to that file with the value that the run was trained with "
+    )
+    again = config_of(run.root, override), compose(f"run.resume={run.root}", override)
+    tries = [partial(find_start_point, config) for config in again]
+    for use in (*tries, partial(trained_config, run.checkpoint(100))):
+        with pytest.raises(ConfigError, match=said):
+            use()
+
+
+def test_a_wrong_value_that_the_command_line_overrides_is_blamed_on_the_file(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(run.root.parent)
+    as_saved_by_another_version(run, "algo.learning_rate", -1.0)
+    config = config_of(run.root, "algo.learning_rate=1e-4")
+    with pytest.raises(ConfigError, match=r"^run/config\.json: algo\.learning_rate=-1\.0: must"):
+        find_start_point(config)
 
 
 def test_auto_names_a_broken_configuration(run: RunPaths):

@@ -13,6 +13,7 @@ from plain_run import add_checkpoint, constant_policy, make_plain_run
 
 from gmijax.cli.compose import compose
 from gmijax.player.plain_env import PlainEnv
+from gmijax.runs.folder import META
 from gmijax.viewer import checkpoints, requests
 from gmijax.viewer.checkpoints import Checkpoints
 from gmijax.viewer.loop import IDLE_S, Loop, View
@@ -257,6 +258,16 @@ def test_a_checkpoint_that_is_chosen_stays(tmp_path: Path) -> None:
     assert stand.loop.view.checkpoints == tuple(map(run.checkpoint, (100, 200, 300)))
     stand.loop.do(requests.FollowTraining(True))
     assert action_of(stand) == pytest.approx(0.3)
+
+
+def test_a_damaged_checkpoint_is_not_taken(tmp_path: Path) -> None:
+    run, stand = following(tmp_path / "run", 100)
+    add_checkpoint(run, 200)
+    (run.checkpoint(200) / META).write_text("{")
+    stand.pass_s(2.5, turn_s=0.05)
+    assert stand.loop.view.checkpoint == run.checkpoint(100)
+    assert stand.loop.view.problem == "200 steps: gone, damaged, or no policy"
+    assert action_of(stand) == pytest.approx(0.0)  # As the simulation began.
 
 
 def test_a_checkpoint_may_vanish_before_it_is_read(
