@@ -102,7 +102,7 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
     for text, after in zip_longest(arguments, arguments[1:], fillvalue="-"):
         if text.startswith("-"):
             key, equals, value = text.lstrip("-").partition("=")
-            if not equals and not after.startswith("-"):
+            if not equals and not after.startswith("-") and "=" not in after:
                 equals, value = "=", after  # `--num-envs 64`, as others have it.
             meant = f"; did you mean {key.replace('-', '_')}={value}?" if key and equals else ""
             allowed = "--help, --verbose, --cfg job, key=value"

@@ -55,6 +55,8 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "--num-envs=64", "unknown option --num-envs=64; allowed: --help, --verbose, "),
     ("train", "--num-envs=64", "; did you mean num_envs=64?"),
     ("train", "--num_envs 64", "; did you mean num_envs=64?"),
+    ("export", "--json run.dir=X", "--help, --verbose, --cfg job, key=value\n"),
+    ("pack", "seed= -- true {seed}", "seed=: must not be empty\n"),
     ("sweep", "--seed 1 --quiet", "unknown option --seed; allowed: --help, --verbose, "),
     ("train", "seed=0,1", "(a list stands in brackets); gmijax sweep takes several"),
     ("train", "seed = 3", "seed = 3: remove the space: seed=3"),
@@ -231,7 +233,8 @@ REFUSED: list[tuple[str, str, str]] = [
     # Searches.
     ("search", "num_envs=64 plan.gmis_per_gpu=2", "nothing to search for; make one of them auto"),
     ("search", "search.gmis_per_gpu=[2,2]", "search.gmis_per_gpu=[2, 2]: expected distinct"),
-    ("search", "search.num_envs=[]", "search.num_envs=[]: expected distinct numbers"),
+    ("search", "search.num_envs=[]", "search.num_envs=[]: expected at least one number\n"),
+    ("search", "search.gmis_per_gpu=[]", "search.gmis_per_gpu=[]: expected at least one number\n"),
     ("search", "search.num_envs=[0]", "search.num_envs=0: must be at least 1"),
     ("search", "search.impls=[cuda]", "search.impls=cuda: expected one of jax, warp"),
     ("search", "search.budget_s=2", "search.budget_s=2: too small for one profile"),
