@@ -40,7 +40,7 @@ def main(argv: Sequence[str]) -> int:
     if "--help" in argv or "-h" in argv:
         sys.stdout.write(USAGE)
         return EXIT_OK
-    return exit_code_of("list_envs", lambda: _list(argv))
+    return exit_code_of("list-envs", lambda: _list(argv))
 
 
 def _list(argv: Sequence[str]) -> None:

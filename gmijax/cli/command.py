@@ -96,7 +96,8 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
     if "--cfg" in arguments:
         at = arguments.index("--cfg")
         if arguments[at + 1 : at + 2] != ["job"]:
-            raise ConfigError(f"--cfg {' '.join(arguments[at + 1 : at + 2])}: allowed: job")
+            given = [text for text in arguments[at : at + 2] if "=" not in text]
+            raise ConfigError(f"{' '.join(given)}: allowed: job")
         del arguments[at : at + 2]
         show = True
     for text, after in zip_longest(arguments, arguments[1:], fillvalue="-"):

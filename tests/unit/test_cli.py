@@ -56,6 +56,10 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "--num-envs=64", "; did you mean num_envs=64?"),
     ("train", "--num_envs 64", "; did you mean num_envs=64?"),
     ("export", "--json run.dir=X", "--help, --verbose, --cfg job, key=value\n"),
+    ("train", "env=ant --cfg", "gmijax.train: --cfg: allowed: job\n"),
+    ("train", "--cfg env=ant", "gmijax.train: --cfg: allowed: job\n"),
+    ("train", "--cfg all", "gmijax.train: --cfg all: allowed: job\n"),
+    ("list-envs", "x", "gmijax.list-envs: x: allowed: --help\n"),
     ("pack", "seed= -- true {seed}", "seed=: must not be empty\n"),
     ("sweep", "--seed 1 --quiet", "unknown option --seed; allowed: --help, --verbose, "),
     ("train", "seed=0,1", "(a list stands in brackets); gmijax sweep takes several"),
@@ -297,6 +301,22 @@ def test_a_file_in_place_of_a_run_folder_is_said_to_be_no_folder(
     done = run(command, f"{key}=policy.npz", cwd=tmp_path)
     assert done.stderr == f"gmijax.{command}: {key}=policy.npz: is not a folder\n"
     assert done.code == 2
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"),
+    [
+        ("ball", "; did you mean run.dir=runs/ball?"),
+        ("ant", "; did you mean env=ant?"),
+        ("..", ""),
+        (LONG, ""),
+    ],
+)
+def test_a_word_that_names_a_run_is_taken_for_it(word: str, hint: str, tmp_path: Path) -> None:
+    for name in ("ball", "ant"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+    done = run("play", word, cwd=tmp_path)
+    assert done.stderr == f"gmijax.play: {word}: expected key=value{hint}\n"
 
 
 @pytest.mark.parametrize(("command", "line", "said"), REFUSED)
