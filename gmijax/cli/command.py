@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import zip_longest
@@ -19,6 +18,7 @@ from gmijax.config import ServeConfig, TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import open_console
 from gmijax.control.exit_codes import exit_code_of
+from gmijax.control.output import as_output, write_output
 from gmijax.errors import ConfigError
 from gmijax.sweeps.sweep import SweepWork, run_sweep
 
@@ -48,12 +48,13 @@ def command(
     def whole() -> None:
         if asked := [at for at, word in enumerate(argv) if word in ("--help", "-h")]:
             topic = next(iter(argv[asked[0] + 1 : asked[0] + 2]), None)
-            print_help(name, cls, partial(defaults, name), choices, topic)
+            with as_output():
+                print_help(name, cls, partial(defaults, name), choices, topic)
             return
         overrides, show, verbose = _split_options(argv)
         made = build(name, cls, overrides) if make is None else make(overrides)
         if show:
-            sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(dict(shown(made)))))
+            write_output(OmegaConf.to_yaml(OmegaConf.create(dict(shown(made)))))
         else:
             console = open_console(show="verbose" if verbose else True)
             console.opening = _task_nobody_chose(made, overrides)
