@@ -35,11 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         verb, rest = (rest[0], ["--help", *rest[1:]]) if rest else ("--help", [])
     verb = verb.replace("_", "-")  # As the module is called.
     if verb in ("-h", "--help"):
-        sys.stdout.write(_usage())
-        return 0
+        return _printed(_usage())
     if verb == "--version":
-        sys.stdout.write(f"gmijax {__version__}\n")
-        return 0
+        return _printed(f"gmijax {__version__}\n")
     if verb in ("-sc", "--shell-completion"):
         from gmijax.cli.completion import complete
 
@@ -54,6 +52,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:  # While its packages are imported.
         sys.stderr.write(f"gmijax.{verb}: interrupted\n")
         return 130
+
+
+def _printed(text: str) -> int:
+    from gmijax.control.output import write_output
+    from gmijax.errors import GmijaxError
+
+    try:
+        write_output(text)
+    except GmijaxError as error:
+        sys.stderr.write(f"gmijax: {error}\n")
+        return 1
+    return 0
 
 
 def _usage() -> str:

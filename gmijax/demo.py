@@ -17,6 +17,7 @@ from gmijax.config.env import PhysicsConfig
 from gmijax.config.play import PlayRunConfig
 from gmijax.control.console import SMALL_TASK, nearby, open_console, print_next, training_of
 from gmijax.control.exit_codes import exit_code_of
+from gmijax.control.output import write_output
 from gmijax.deploy import shipped
 from gmijax.deploy.pictures import film
 from gmijax.deploy.shipped import SHIPPED
@@ -44,8 +45,7 @@ _EPISODES: Final = 16
 def main(argv: Sequence[str]) -> int:
     """Runs the command; returns the exit code."""
     if "--help" in argv or "-h" in argv:
-        sys.stdout.write(USAGE)
-        return 0
+        return exit_code_of("demo", lambda: write_output(USAGE))
     return exit_code_of("demo", lambda: demo(argv))
 
 

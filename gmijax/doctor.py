@@ -11,7 +11,8 @@ from rich.table import Table
 
 from gmijax.control.console import UserConsole, open_console, print_next
 from gmijax.control.diagnosis import Diagnosis, diagnose
-from gmijax.control.exit_codes import EXIT_FAILED, EXIT_OK, exit_code_of
+from gmijax.control.exit_codes import EXIT_FAILED, exit_code_of
+from gmijax.control.output import as_output, write_output
 from gmijax.control.system_info import inspect_system
 from gmijax.errors import ConfigError
 from gmijax.machine.mig_split import split_commands
@@ -48,8 +49,7 @@ class DoctorOptions(NamedTuple):
 def main(argv: Sequence[str]) -> int:
     """Runs the command; returns the exit code."""
     if "--help" in argv or "-h" in argv:
-        sys.stdout.write(USAGE)
-        return EXIT_OK
+        return exit_code_of("doctor", lambda: write_output(USAGE))
     problems: list[str] = []
     code = exit_code_of("doctor", lambda: problems.extend(_answer(parse(argv))))
     return EXIT_FAILED if problems else code
@@ -58,18 +58,19 @@ def main(argv: Sequence[str]) -> int:
 def _answer(options: DoctorOptions) -> Sequence[str]:
     """Prints what was asked for; returns what is broken."""
     if options.mig is not None:
-        sys.stdout.write(split_text(options.mig, options.gpu, detect_machine()))
+        write_output(split_text(options.mig, options.gpu, detect_machine()))
         return ()
     if options.cluster is not None:
         return show_nodes(options.cluster, as_json=options.as_json)
     found = diagnose(inspect_system())
     if options.as_json:
-        sys.stdout.write(json.dumps(found.to_dict(), indent=2) + "\n")
+        write_output(json.dumps(found.to_dict(), indent=2) + "\n")
     else:
-        console = open_console(show="verbose" if options.verbose else True)
-        show(found, console)
-        if not found.problems:
-            print_next(console, ("see a trained policy, then train one", "gmijax demo"))
+        with as_output():
+            console = open_console(show="verbose" if options.verbose else True)
+            show(found, console)
+            if not found.problems:
+                print_next(console, ("see a trained policy, then train one", "gmijax demo"))
     return found.problems
 
 
@@ -140,12 +141,12 @@ def show_nodes(address: str, *, as_json: bool) -> Sequence[str]:
     if as_json:
         data = {"ok": not problems, "nodes": nodes_as_data(nodes)}
         data |= {"problems": problems, "notes": notes}
-        sys.stdout.write(json.dumps(data, indent=2) + "\n")
+        write_output(json.dumps(data, indent=2) + "\n")
     else:
         said = [*lines_of_nodes(nodes), *(f"note: {note}" for note in notes)]
         said += [f"problem: {problem}" for problem in problems]
         said += [] if problems else ["a job can be on all of them"]
-        sys.stdout.write("\n".join(said) + "\n")
+        write_output("\n".join(said) + "\n")
     return problems
 
 

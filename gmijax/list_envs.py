@@ -13,7 +13,8 @@ from rich.table import Table
 
 from gmijax.config.env import ROBOTS
 from gmijax.control.console import open_console, print_next, training_of
-from gmijax.control.exit_codes import EXIT_OK, exit_code_of
+from gmijax.control.exit_codes import exit_code_of
+from gmijax.control.output import as_output, write_output
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.sim.registry import SUITES, TASKS, missing_of
@@ -38,14 +39,18 @@ class Task(NamedTuple):
 def main(argv: Sequence[str]) -> int:
     """Runs the command; returns the exit code."""
     if "--help" in argv or "-h" in argv:
-        sys.stdout.write(USAGE)
-        return EXIT_OK
-    return exit_code_of("list_envs", lambda: _list(argv))
+        return exit_code_of("list-envs", lambda: write_output(USAGE))
+    return exit_code_of("list-envs", lambda: _list(argv))
 
 
 def _list(argv: Sequence[str]) -> None:
     if argv:
         raise ConfigError(f"{argv[0]}: allowed: --help")
+    with as_output():
+        _print_tasks()
+
+
+def _print_tasks() -> None:
     table = Table(box=None, pad_edge=False)
     table.add_column("env", no_wrap=True)
     for heading in ("observations", "actions", "steps"):

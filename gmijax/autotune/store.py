@@ -23,7 +23,7 @@ from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.config.schema import require_positive
 from gmijax.errors import ConfigError, DamagedFile, GmijaxError
 from gmijax.runs.cache import cache_folder
-from gmijax.runs.folder import read_json, write_json
+from gmijax.runs.folder import read_json, why_no_folder, write_json
 from gmijax.runs.names import nearby
 
 _DIGEST_LENGTH = 10
@@ -54,9 +54,10 @@ class ProfileStore:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigError(
-                f"search.store={folder}: cannot be used ({error.strerror})"
-            ) from None
+            # What stands there may be a file.
+            is_taken = isinstance(error, FileExistsError)
+            wrong = why_no_folder(folder) if is_taken else f"cannot be used ({error.strerror})"
+            raise ConfigError(f"search.store={folder}: {wrong}") from None
         self._records = self._load()
 
     def kept_or(

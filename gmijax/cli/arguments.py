@@ -15,6 +15,7 @@ from hydra.errors import HydraException
 
 from gmijax.cli.groups import choices
 from gmijax.errors import ConfigError
+from gmijax.runs.folder import RUNS
 
 _MOST_VALUES = 2000
 """In one argument."""
@@ -111,6 +112,8 @@ def _meant(word: str) -> str:
     if difflib.get_close_matches(word, ("help",), cutoff=0.7):
         return "; did you mean --help?"
     groups = {name: group for group in ("env", "algo") for name in choices(group)}
+    if word not in (*groups, ".", "..") and os.path.isdir(RUNS / word):
+        return f"; did you mean run.dir={RUNS / word}?"
     close = difflib.get_close_matches(word, groups, n=1)
     return f"; did you mean {groups[close[0]]}={close[0]}?" if close else ""
 

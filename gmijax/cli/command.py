@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import zip_longest
@@ -19,6 +18,7 @@ from gmijax.config import ServeConfig, TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import open_console
 from gmijax.control.exit_codes import exit_code_of
+from gmijax.control.output import as_output, write_output
 from gmijax.errors import ConfigError
 from gmijax.sweeps.sweep import SweepWork, run_sweep
 
@@ -48,12 +48,13 @@ def command(
     def whole() -> None:
         if asked := [at for at, word in enumerate(argv) if word in ("--help", "-h")]:
             topic = next(iter(argv[asked[0] + 1 : asked[0] + 2]), None)
-            print_help(name, cls, partial(defaults, name), choices, topic)
+            with as_output():
+                print_help(name, cls, partial(defaults, name), choices, topic)
             return
         overrides, show, verbose = _split_options(argv)
         made = build(name, cls, overrides) if make is None else make(overrides)
         if show:
-            sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(dict(shown(made)))))
+            write_output(OmegaConf.to_yaml(OmegaConf.create(dict(shown(made)))))
         else:
             console = open_console(show="verbose" if verbose else True)
             console.opening = _task_nobody_chose(made, overrides)
@@ -96,13 +97,14 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
     if "--cfg" in arguments:
         at = arguments.index("--cfg")
         if arguments[at + 1 : at + 2] != ["job"]:
-            raise ConfigError(f"--cfg {' '.join(arguments[at + 1 : at + 2])}: allowed: job")
+            given = [text for text in arguments[at : at + 2] if "=" not in text]
+            raise ConfigError(f"{' '.join(given)}: allowed: job")
         del arguments[at : at + 2]
         show = True
     for text, after in zip_longest(arguments, arguments[1:], fillvalue="-"):
         if text.startswith("-"):
             key, equals, value = text.lstrip("-").partition("=")
-            if not equals and not after.startswith("-"):
+            if not equals and not after.startswith("-") and "=" not in after:
                 equals, value = "=", after  # `--num-envs 64`, as others have it.
             meant = f"; did you mean {key.replace('-', '_')}={value}?" if key and equals else ""
             allowed = "--help, --verbose, --cfg job, key=value"

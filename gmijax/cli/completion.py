@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Iterable, Sequence
 
 from hydra import initialize_config_dir
@@ -12,6 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 from gmijax.cli.answers import own_answers
 from gmijax.cli.groups import config_dir
 from gmijax.control.exit_codes import exit_code_of
+from gmijax.control.output import write_output
 from gmijax.errors import ConfigError
 
 
@@ -33,13 +33,13 @@ def _complete(argv: Sequence[str], verbs: Iterable[str]) -> None:
         line = os.environ.get("COMP_LINE", "").lstrip().partition(" ")[2].lstrip()
         name, separator, _ = line.partition(" ")
         if not separator:
-            sys.stdout.write("\n".join(verbs) + "\n")
+            write_output("\n".join(verbs) + "\n")
             return
         if not (config_dir() / f"{name}.yaml").is_file():
             return  # It takes no keys.
         words = line.split()[1:] + [""] * line.endswith(" ")
         if (own := own_answers(name, words)) is not None:
-            sys.stdout.write("\n".join(own) + "\n")
+            write_output("\n".join(own) + "\n")
             return
         os.environ["COMP_LINE"] = line
     with initialize_config_dir(str(config_dir()), version_base=None):

@@ -114,6 +114,8 @@ def _values(item: Override) -> Choices | Interval:
     value = item.value()
     is_list = isinstance(value, ChoiceSweep) and value.simple_form
     text = str(item.input_line).partition("=")[2]
+    if not text.strip():  # As of a variable that the shell does not have.
+        raise ConfigError(f"{item.input_line}: must not be empty")
     if (is_list or not item.is_sweep_override()) and not any(mark in text for mark in _MARKS):
         return Choices(_distinct(item, [part.strip() for part in text.split(",")]))
     if not item.is_sweep_override():

@@ -11,7 +11,7 @@ from gmijax.cluster.checks import by_name, differences_in_versions
 from gmijax.cluster.node import Facts, Node
 from gmijax.cluster.ray_nodes import RayCluster
 from gmijax.config import ClusterConfig
-from gmijax.errors import NodeLost
+from gmijax.errors import ConfigError, NodeLost
 from gmijax.machine.differences import differences_in, differences_in_gpus, gpu_names
 
 _LITTLE: Final = 0.001
@@ -51,12 +51,22 @@ def survey(address: str) -> dict[str, NodeInfo]:
     """All nodes of the cluster of Ray at this address, by theirs.
 
     Args:
-      address: as `cluster.address`.
+      address: as `cluster.address`; in errors it is `cluster`.
 
     Raises:
       ConfigError: there is no cluster.
       NodeLost: a node is gone while it is asked.
     """
+    try:
+        return _survey(address)
+    except ConfigError as error:
+        text = str(error)
+        for key in ("cluster.engine=ray", f"cluster.address={address}"):  # Nobody typed them.
+            text = text.replace(f"{key}: ", f"cluster={address}: ", 1)
+        raise ConfigError(text) from None
+
+
+def _survey(address: str) -> dict[str, NodeInfo]:
     cluster = RayCluster(ClusterConfig(engine="ray", address=address, wait_s=0.0), SurveyedNode)
     try:
         found: dict[str, NodeInfo] = {}

@@ -47,7 +47,9 @@ class SearchConfig(KeyGroup):
         super().__post_init__()
         for key in ("gmis_per_gpu", "num_envs"):
             values = getattr(self, key)
-            if not values or len(set(values)) != len(values):
+            if not values:
+                raise ConfigError(f"search.{key}=[]: expected at least one number")
+            if len(set(values)) != len(values):
                 raise ConfigError(f"search.{key}={list(values)}: expected distinct numbers")
         if bad := [impl for impl in self.impls if impl not in ("jax", "warp")]:
             raise ConfigError(f"search.impls={bad[0]}: expected one of jax, warp")

@@ -14,6 +14,7 @@ from typing import Any, Final, Literal, TextIO, TypeAlias
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from gmijax.control.output import discard
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.names import nearby
@@ -57,11 +58,7 @@ class _BestEffortStream:
             act(stream)
         except (OSError, ValueError):
             self._stream = None
-            # What is left in its buffer would fail once more when Python ends.
-            with suppress(OSError, ValueError):
-                nowhere = os.open(os.devnull, os.O_WRONLY)
-                os.dup2(nowhere, stream.fileno())
-                os.close(nowhere)
+            discard(stream)
 
 
 class UserConsole(Console):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import signal
 import sys
 import threading
@@ -32,6 +33,7 @@ def exit_code_of(name: str, run: Callable[[], object]) -> int:
     """Runs the command `name` and turns every error into its exit code."""
     try:
         with _interrupted_by_signals():
+            _require_working_folder()
             run()
         return EXIT_OK
     except ConfigError as error:
@@ -49,6 +51,15 @@ def exit_code_of(name: str, run: Callable[[], object]) -> int:
         where = error.filename2 or error.filename
         _complain(name, f"{nearby(Path(where)) if where else 'a file'}: {error.strerror}")
         return EXIT_BAD_INPUT if error.errno in OF_KINDS else EXIT_FAILED
+
+
+def _require_working_folder() -> None:
+    try:
+        os.getcwd()
+    except FileNotFoundError:  # Else what is looked for first in it would be called missing.
+        raise ConfigError(
+            "the working directory no longer exists; change into another one"
+        ) from None
 
 
 @contextmanager

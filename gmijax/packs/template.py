@@ -68,8 +68,10 @@ def require_names(arguments: Sequence[str], names: Mapping[str, str]) -> None:
                 f"{name}={values}: every job has {{{name}}} of its own; give another name"
             )
         if name not in found:
+            others = ", ".join(f"{{{other}}}" for other in found)
+            only = f" (it has {others})" if others else ""
             raise ConfigError(
-                f"{name}={values}: the command has no {{{name}}}, so all jobs would be equal"
+                f"{name}={values}: the command has no {{{name}}}{only}, so all jobs would be equal"
             )
     for name in found:
         if name not in names and name not in OWN_NAMES:

@@ -185,7 +185,7 @@ def create_run(run_dir: str | None, name: str | None, prefix: str) -> RunPaths:
             require_new_run(run_dir, name)
             continue
         except OSError as error:
-            raise ConfigError(f"{shown}: cannot make the folder ({error.strerror})") from None
+            raise ConfigError(f"{shown}: {no_folder_made(error)}") from None
         return RunPaths(candidate.resolve())
     raise ConfigError(f"{shown}: no free name")
 
@@ -225,6 +225,11 @@ def given_run(run_dir: str | None, name: str | None) -> Path | None:
 def why_no_folder(path: str | os.PathLike[str]) -> str:
     """What to say of a path that is no folder."""
     return "is not a folder" if os.path.exists(path) else "no such folder"
+
+
+def no_folder_made(error: OSError) -> str:
+    """What to say of a path at which no folder can be made."""
+    return f"cannot make the folder ({error.strerror})"
 
 
 def require_new_run(run_dir: str | None, name: str | None, hint: str = "") -> None:

@@ -7,6 +7,7 @@ import errno
 import io
 import math
 import os
+import re
 import textwrap
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -42,6 +43,9 @@ _OF_JOB = (
 _OF_SETTING = ("n", "interquartile_mean", "low", "high", "window_full")
 
 _ROOM_BYTES = 1 << 16
+
+_MOST_TYPED_DIGITS = 8
+"""A number with a point and more digits was drawn: nobody types that."""
 
 
 class JobsReport:
@@ -177,11 +181,12 @@ def tables(report: Mapping[str, Any], ranking: Ranking) -> list[Table]:
 
 
 def _setting_table(settings: Sequence[Row], ranking: Ranking) -> Table:
+    labels = _labels(settings)
     num_seeds = max(setting["n"] for setting in settings)
     heading = f"{ranking.objective}, {name_of_middle(num_seeds)}"
     rows: list[Sequence[str]] = []
-    for rank, setting in enumerate(settings, 1):
-        label, of = label_of(setting["overrides"]) or "all seeds", len(setting["jobs"])
+    for rank, (setting, own) in enumerate(zip(settings, labels, strict=True), 1):
+        label, of = own or "all seeds", len(setting["jobs"])
         n = str(of) if setting["n"] == of else f"{setting['n']} of {of}"
         if setting["quartiles"] is None:
             rows.append(("-", label, "-", "-", n))
@@ -199,14 +204,31 @@ def _job_table(jobs: Sequence[Row], ranking: Ranking) -> Table:
     is_ranked = any(row["value"] is not None for row in jobs)
     listed = [(str(rank), row) for rank, row in enumerate(ranked(jobs, ranking), 1)]
     listed += [("-", row) for row in jobs if row["value"] is None]
-    for rank, row in listed:
+    labels = _labels([row for _, row in listed])
+    for (rank, row), label in zip(listed, labels, strict=True):
         value = shown(row["value"], row["window_full"], row["episodes"])
-        label, steps = label_of(row["overrides"]), row["env_steps"]
+        steps = row["env_steps"]
         wall = "" if is_ranked else clock(row["wall_s"])
         steps = f"{steps:,}" if steps else "-"
         rows.append((rank, str(row["job"]), label, value, steps, wall, row["state"]))
     headings = ("rank", "job", "overrides", ranking.objective, "steps", "time", "state")
     return _table(headings, rows)
+
+
+def _labels(rows: Sequence[Row]) -> list[str]:
+    """Overrides of every row, with drawn numbers short where that tells all rows apart."""
+    whole = [label_of(row["overrides"]) for row in rows]
+    short = [
+        label_of({key: _short(value) for key, value in row["overrides"].items()}) for row in rows
+    ]
+    return short if len(set(short)) == len(set(whole)) else whole
+
+
+def _short(value: str) -> str:
+    """Four significant digits of a drawn number; anything else as it is."""
+    mantissa = re.match(r"-?([0-9]*\.[0-9]*)(e|$)", value)  # Not an integer, as of a seed.
+    digits = mantissa[1].replace(".", "").lstrip("0") if mantissa else ""
+    return f"{float(value):.4g}" if len(digits) > _MOST_TYPED_DIGITS else value
 
 
 def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
@@ -215,7 +237,7 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     cells = [column for column in zip(*rows, strict=True)] or [()] * len(headings)
     kept = [n for n, column in enumerate(cells) if set(column) - {"", "-"}]
     for number in kept:
-        table.add_column(headings[number])
+        table.add_column(headings[number], overflow="fold")
     for row in rows:
         table.add_row(*(row[number] for number in kept))
     return table

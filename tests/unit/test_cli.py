@@ -55,6 +55,12 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "--num-envs=64", "unknown option --num-envs=64; allowed: --help, --verbose, "),
     ("train", "--num-envs=64", "; did you mean num_envs=64?"),
     ("train", "--num_envs 64", "; did you mean num_envs=64?"),
+    ("export", "--json run.dir=X", "--help, --verbose, --cfg job, key=value\n"),
+    ("train", "env=ant --cfg", "gmijax.train: --cfg: allowed: job\n"),
+    ("train", "--cfg env=ant", "gmijax.train: --cfg: allowed: job\n"),
+    ("train", "--cfg all", "gmijax.train: --cfg all: allowed: job\n"),
+    ("list-envs", "x", "gmijax.list-envs: x: allowed: --help\n"),
+    ("pack", "seed= -- true {seed}", "seed=: must not be empty\n"),
     ("sweep", "--seed 1 --quiet", "unknown option --seed; allowed: --help, --verbose, "),
     ("train", "seed=0,1", "(a list stands in brackets); gmijax sweep takes several"),
     ("train", "seed = 3", "seed = 3: remove the space: seed=3"),
@@ -231,7 +237,8 @@ REFUSED: list[tuple[str, str, str]] = [
     # Searches.
     ("search", "num_envs=64 plan.gmis_per_gpu=2", "nothing to search for; make one of them auto"),
     ("search", "search.gmis_per_gpu=[2,2]", "search.gmis_per_gpu=[2, 2]: expected distinct"),
-    ("search", "search.num_envs=[]", "search.num_envs=[]: expected distinct numbers"),
+    ("search", "search.num_envs=[]", "search.num_envs=[]: expected at least one number\n"),
+    ("search", "search.gmis_per_gpu=[]", "search.gmis_per_gpu=[]: expected at least one number\n"),
     ("search", "search.num_envs=[0]", "search.num_envs=0: must be at least 1"),
     ("search", "search.impls=[cuda]", "search.impls=cuda: expected one of jax, warp"),
     ("search", "search.budget_s=2", "search.budget_s=2: too small for one profile"),
@@ -294,6 +301,22 @@ def test_a_file_in_place_of_a_run_folder_is_said_to_be_no_folder(
     done = run(command, f"{key}=policy.npz", cwd=tmp_path)
     assert done.stderr == f"gmijax.{command}: {key}=policy.npz: is not a folder\n"
     assert done.code == 2
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"),
+    [
+        ("ball", "; did you mean run.dir=runs/ball?"),
+        ("ant", "; did you mean env=ant?"),
+        ("..", ""),
+        (LONG, ""),
+    ],
+)
+def test_a_word_that_names_a_run_is_taken_for_it(word: str, hint: str, tmp_path: Path) -> None:
+    for name in ("ball", "ant"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+    done = run("play", word, cwd=tmp_path)
+    assert done.stderr == f"gmijax.play: {word}: expected key=value{hint}\n"
 
 
 @pytest.mark.parametrize(("command", "line", "said"), REFUSED)

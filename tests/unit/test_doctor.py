@@ -22,6 +22,7 @@ from gmijax.control.console import UserConsole
 from gmijax.control.diagnosis import Diagnosis, diagnose
 from gmijax.control.features import EXTRAS, OpenGl, features
 from gmijax.control.system_info import REQUIRED, JaxView, SystemInfo, ask_jax, try_mps
+from gmijax.errors import ConfigError
 from gmijax.machine import opengl
 
 PLUGINS = ("jax-cuda12-plugin", "jax-cuda13-plugin")
@@ -302,3 +303,24 @@ def test_without_a_gpu_the_table_has_what_only_gpus_have_for_those_who_ask(
         said = capsys.readouterr().out
         assert ("\nreducer" in said) == ("\nbackend" in said) == shown
         assert "\nphysics" in said
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (
+            "cluster.engine=ray: the package ray is not installed",
+            "the package ray is not installed",
+        ),
+        ("cluster.address=auto: no cluster of Ray there (x: y)", "no cluster of Ray there (x: y)"),
+    ],
+)
+def test_errors_of_a_cluster_name_what_was_typed(
+    wrong: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: object) -> None:
+        raise ConfigError(wrong)
+
+    monkeypatch.setattr("gmijax.cluster.survey.RayCluster", refuse)
+    assert doctor.main(["cluster=auto"]) == 2
+    assert capsys.readouterr().err == f"gmijax.doctor: cluster=auto: {said}\n"

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from gmijax.__main__ import main
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.supervise.stop_signals import STOP_SIGNALS
 
@@ -43,3 +45,16 @@ def test_signals_that_somebody_ignores_or_hears_are_left_alone(handler: signal.H
     signal.signal(signal.SIGHUP, handler)
     assert exit_code_of("play", lambda: signal.raise_signal(signal.SIGHUP)) == 0
     assert signal.getsignal(signal.SIGHUP) is handler
+
+
+def test_a_working_directory_that_is_gone_is_called_that(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    for line in (["train", "env=ant"], ["list-envs"], ["pack", "--", "true"]):
+        assert main(line) == 2
+        said = "the working directory no longer exists; change into another one"
+        assert capsys.readouterr().err == f"gmijax.{line[0]}: {said}\n"

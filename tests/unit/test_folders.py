@@ -115,6 +115,21 @@ def test_a_data_set_without_its_keys_is_damaged(
         open_dataset(DataPaths(tmp_path), ABOUT)
 
 
+def test_experience_that_has_no_folder_is_refused_as_a_run_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    Path("train.py").touch()
+    for folder, why in (
+        ("train.py", "is not a folder"),
+        ("train.py/x", "cannot make the folder (Not a directory)"),
+        ("/proc/x", "cannot make the folder (No such file or directory)"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            open_dataset(DataPaths(Path(folder)), ABOUT)
+        assert str(error.value) == f"output.dir={folder}: {why}"
+
+
 def test_an_interrupted_job_names_the_folder_of_its_shards_if_there_are_some(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -62,6 +62,39 @@ def test_a_reader_that_is_gone_does_not_end_the_job(tmp_path: Path, shell: str):
     assert (tmp_path / "done").exists()
 
 
+@pytest.mark.parametrize(
+    ("line", "name", "unbuffered"),
+    [
+        ("play --help", "gmijax.play", "1"),
+        ("play --help", "gmijax.play", ""),
+        ("play --cfg job", "gmijax.play", ""),
+        ("list-envs", "gmijax.list-envs", "1"),
+        ("list-envs", "gmijax.list-envs", ""),
+        ("doctor --help", "gmijax.doctor", "1"),
+        ("--version", "gmijax", ""),
+    ],
+)
+def test_a_command_that_cannot_print_its_answer_has_failed(
+    line: str, name: str, unbuffered: str, tmp_path: Path
+):
+    found = []
+    for shell in ("{} > /dev/full", "{} >&-", "{} | true"):
+        command = shell.format(f"{sys.executable} -m gmijax {line}")
+        done = subprocess.run(
+            ["bash", "-c", f"set -o pipefail; {command}"],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(CHECKOUT), "PYTHONUNBUFFERED": unbuffered},
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        found.append((done.returncode, done.stderr))
+    said = f"{name}: the output cannot be written "
+    assert found[:2] == [(1, f"{said}(No space left on device)\n"), (1, f"{said}(it is closed)\n")]
+    assert found[2] == (0, "")  # A reader that is gone has read enough.
+
+
 def test_names_in_brackets_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]):
     open_console(show=True).print("runs/[lr=0.1] a[/b]")
     assert capsys.readouterr().out == "runs/[lr=0.1] a[/b]\n"

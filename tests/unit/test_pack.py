@@ -119,6 +119,11 @@ def test_keys_that_hold_text_need_no_quotes_of_hydra() -> None:
     assert settings.metric == r"^R: (-?[\d.]+), x$"
 
 
+def test_a_value_in_quotes_may_be_empty() -> None:
+    jobs = build_pack(["flag=--fast,''"], ["true", "{flag}"]).jobs
+    assert [job.overrides["flag"] for job in jobs] == ["--fast", ""]
+
+
 @pytest.mark.parametrize(
     ("words", "command", "said"),
     [

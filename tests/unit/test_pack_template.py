@@ -36,6 +36,8 @@ def test_placeholders_are_named_once_in_order():
     ("arguments", "names", "message"),
     [
         (["{sed}"], {"seed": "0,1"}, r"^seed=0,1: the command has no \{seed\}"),
+        (["{sed}{job}"], {"seed": "0"}, r"no \{seed\} \(it has \{sed\}, \{job\}\), so all"),
+        (["true"], {"seed": "0"}, r"no \{seed\}, so all"),
         (
             ["{seed}", "{sead}"],
             {"seed": "0"},

@@ -86,6 +86,8 @@ def test_a_folder_that_cannot_be_used_is_bad_input(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"search\.store=.*file/x: cannot be used"):
         store(tmp_path / "file" / "x")
+    with pytest.raises(ConfigError, match=r"search\.store=.*file: is not a folder$"):
+        store(tmp_path / "file")
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])

@@ -602,6 +602,37 @@ def test_the_ranking_has_full_windows_first_and_jobs_without_a_value_below(
     assert [job["window_full"] for job in report["jobs"][:3]] == [True, False, True]
 
 
+def test_what_was_drawn_is_whole_in_80_columns(tmp_path: Path) -> None:
+    jobs = ended(("algo.entropy_cost=1,2,3,4",), [(1.0, 12, False)] * 4)
+    drawn = ("0.0009847123400129", "2.2204460492503131e-05", "0.00012345678", "1234567890")
+    jobs = [
+        dataclasses.replace(job, overrides={"algo.learning_rate": value})
+        for job, value in zip(jobs, drawn, strict=True)
+    ]
+    text, sweep = io.StringIO(), SweepConfig(objective="return")
+    report = JobsReport(jobs, sweep, dict, SweepPaths(tmp_path), OpenFolder(tmp_path, "x"), 0.0)
+    report.end("completed")
+    [table] = tables(report.data, sweep)
+    Console(file=text, width=80).print(table)
+    lines = text.getvalue().splitlines()
+    begin, end = lines[0].index("overrides"), lines[0].index("return")
+    shown = "".join(line[begin:end].strip() for line in lines[1:])
+    values = ("0.0009847", "2.22e-05", "0.00012345678", "1234567890")
+    assert shown == "".join(f"algo.learning_rate={value}" for value in values)
+    assert report.data["jobs"][0]["overrides"]["algo.learning_rate"] == drawn[0]
+
+
+def test_drawn_numbers_that_are_alike_in_short_are_whole(tmp_path: Path) -> None:
+    jobs = ended(("algo.entropy_cost=1,2",), [(1.0, 200, True)] * 2)
+    drawn = ["0.00098471234001", "0.00098471234002"]
+    jobs = [
+        dataclasses.replace(job, overrides={"algo.learning_rate": value})
+        for job, value in zip(jobs, drawn, strict=True)
+    ]
+    [rows] = shown_tables(tmp_path, jobs, SweepConfig(objective="return"))
+    assert [row[2] for row in rows] == [f"algo.learning_rate={value}" for value in drawn]
+
+
 def test_without_anything_to_rank_by_there_is_one_table_of_what_is_known(tmp_path: Path) -> None:
     jobs = ended(("algo.entropy_cost=1,2", "seed=0,1"), [(None, 0, False)] * 4)
     for job in jobs:
