@@ -39,8 +39,8 @@ class Task(NamedTuple):
 def main(argv: Sequence[str]) -> int:
     """Runs the command; returns the exit code."""
     if "--help" in argv or "-h" in argv:
-        return exit_code_of("list-envs", lambda: write_output(USAGE))
-    return exit_code_of("list-envs", lambda: _list(argv))
+        return exit_code_of("list_envs", lambda: write_output(USAGE))
+    return exit_code_of("list_envs", lambda: _list(argv))
 
 
 def _list(argv: Sequence[str]) -> None:

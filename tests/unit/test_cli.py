@@ -59,7 +59,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "env=ant --cfg", "gmijax.train: --cfg: allowed: job\n"),
     ("train", "--cfg env=ant", "gmijax.train: --cfg: allowed: job\n"),
     ("train", "--cfg all", "gmijax.train: --cfg all: allowed: job\n"),
-    ("list-envs", "x", "gmijax.list-envs: x: allowed: --help\n"),
+    ("list-envs", "x", "gmijax.list_envs: x: allowed: --help\n"),
     ("pack", "seed= -- true {seed}", "seed=: must not be empty\n"),
     ("sweep", "--seed 1 --quiet", "unknown option --seed; allowed: --help, --verbose, "),
     ("train", "seed=0,1", "(a list stands in brackets); gmijax sweep takes several"),

@@ -54,7 +54,7 @@ def test_a_working_directory_that_is_gone_is_called_that(
     folder.mkdir()
     monkeypatch.chdir(folder)
     folder.rmdir()
-    for line in (["train", "env=ant"], ["list-envs"], ["pack", "--", "true"]):
+    for line in (["train", "env=ant"], ["list_envs"], ["pack", "--", "true"]):
         assert main(line) == 2
-        said = "the working directory no longer exists; change into another one"
-        assert capsys.readouterr().err == f"gmijax.{line[0]}: {said}\n"
+        wanted = "the working directory no longer exists; change into another one"
+        assert capsys.readouterr().err == f"gmijax.{line[0]}: {wanted}\n"
