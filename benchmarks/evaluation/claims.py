@@ -17,11 +17,9 @@ from benchmarks.evaluation.other_tables import model_fit, searched
 from benchmarks.evaluation.paper import LGR, lgr_gain
 from benchmarks.evaluation.peer_tables import our_rate
 from benchmarks.evaluation.serving_tables import (
-    FEWEST,
     GMIS,
-    MOST,
+    mps_gains,
     mps_over_one,
-    mps_over_share,
     of_communication,
     peak_over_peak,
     templates_gains,
@@ -54,9 +52,7 @@ def claims() -> Values:
         "served_over_one": said_bounds([mps_over_one(task, n) for task in SERVED for n in GMIS]),
         "fixed_total": said_bounds([*fixed_total_ratios().values()]),
         "best_plans": said_bounds([*best_plan_ratios().values()]),
-        "mps": {
-            f"{task}_{n}": said(mps_over_share(task, n)) for task in SERVED for n in (FEWEST, MOST)
-        },
+        "mps": {name: said(gain) for name, gain in mps_gains().items()},
         "from_512": _more_environments(512, 2048),
         "from_2048": _more_environments(2048, 8192),
         "memory": _more_environments(2048, 8192, "device/peak_memory_mib"),

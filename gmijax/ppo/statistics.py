@@ -41,7 +41,7 @@ class RolloutStats(NamedTuple):
 def obs_moments(config: PpoConfig, moments: Moments, obs: Array, out: StepOutput) -> Moments:
     """Statistics of the raw observations [T, N, O] that led to `out`.
 
-    `moments` are those of all observations before, by which outliers are known.
+    `moments` are those of all observations before, by which outliers are recognised.
     """
     if config.obs_outliers == "diverged":
         ended = out.terminated | out.truncated

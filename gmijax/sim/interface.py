@@ -26,8 +26,8 @@ class EnvSpec(NamedTuple):
       control_dt_s: seconds of simulated time per step.
       episode_length: steps after which an episode is truncated.
       reward_terms: names of the addends of the reward, in order.
-      max_abs_obs: beyond this the physics counts as diverging; the environment is
-        ended (see `gmijax.sim.divergence`).
+      max_abs_obs: an observation beyond this counts as diverging physics; the environment
+        is ended (see `gmijax.sim.divergence`).
       metrics: names of the numbers that judge an episode beside its return, such as successes.
       obs_terms: parts of an observation in order, name and length each; they go into exported
         policies. Empty where nobody says.

@@ -1,7 +1,7 @@
 """Custom tasks by file and name: `path/to/file.py:make`. No jax here: the controller checks them.
 
 Every GMI is a process of its own and loads the task anew, so a task must be something that a file
-and a name can show.
+and a name define.
 """
 
 from __future__ import annotations

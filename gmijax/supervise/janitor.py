@@ -71,7 +71,7 @@ class JanitorLink:
             os.close(self._pipe.read_end)
 
     def watch_daemon(self, control: MpsControl) -> None:
-        """Makes the janitor quit this daemon, not started yet, and remove its pipe directory."""
+        """Makes the janitor quit a daemon that is to start, and remove its pipe directory."""
         self._send({"daemon": str(control.pipe_directory), "program": str(control.program)})
 
     def watch_gmi(self, pid: int, group: int | None = None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import signal
 import subprocess
@@ -102,7 +103,7 @@ class Child:
         self._is_client, self._is_asked = process.is_client, False
         self._pipe = GuardPipe()
         self._ended_s: float | None = None
-        self._killed_s: float | None = None
+        self._killed_s = math.inf
         self.lock = process.lock
         self.rest: tuple[ProcessId, ...] = ()
         self.left: tuple[ProcessId, ...] = ()
@@ -158,7 +159,7 @@ class Child:
 
     def kill(self) -> None:
         """Ends it now, and its process group; GMIs end with their controller."""
-        self._killed_s = self._killed_s or running_s()
+        self._killed_s = min(self._killed_s, running_s())
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
 
@@ -166,8 +167,7 @@ class Child:
         """After its end, or in place of it; what is left of its process group ends too."""
         self.kill()
         self._pipe.close()
-        killed_s = self._killed_s or running_s()
-        has_ended(self._process, killed_s + _KILLED_S - running_s())
+        has_ended(self._process, self._killed_s + _KILLED_S - running_s())
         self.left = members_of(self.pid)
 
 

@@ -33,6 +33,7 @@ class Progress:
       episodes: how many the value is a mean over, where that is known.
       latest: the objective in the latest line that has it, over the short window.
       started_s: when this command started it the last time, by the monotonic clock.
+      first_started_s: when it did the first time.
       updated_s: when the first line of metrics came after that.
       reported_s: when the latest line of metrics came.
       ended_s: when it ended after that.
@@ -58,6 +59,7 @@ class Progress:
     episodes: int | None = None
     latest: float | None = None
     started_s: float | None = None
+    first_started_s: float | None = None
     updated_s: float | None = None
     reported_s: float | None = None
     ended_s: float | None = None
@@ -71,17 +73,11 @@ class Progress:
     error: str | None = None
     curve: list[tuple[int, float]] = field(default_factory=list)
     _first_steps: int = 0
-    _first_started_s: float | None = None
 
     @property
     def stage(self) -> tuple[State, int, str | None]:
         """What is reported whenever it changes: state, attempts, and what a job waits for."""
         return self.state, self.attempts, self.note if self.state == "waiting" else None
-
-    @property
-    def first_started_s(self) -> float | None:
-        """When this command started it the first time; None: it has not."""
-        return self.started_s if self._first_started_s is None else self._first_started_s
 
     @property
     def wall_s(self) -> float:
@@ -118,8 +114,9 @@ class Progress:
         self.note, self.error = self.error, None  # Why it runs again, if it does.
         self.state, self.slot, self.node = "running", slot, node
         self.attempts += 1
-        self._first_started_s = self.first_started_s
         self.started_s, self.updated_s, self.ended_s = time.monotonic(), None, None
+        if self.first_started_s is None:
+            self.first_started_s = self.started_s
         self.reports, self.reported_s, self.exit_code = 0, None, None
 
     def take(self, line: Mapping[str, Any], ranking: Ranking) -> None:

@@ -43,6 +43,7 @@ def running_jobs() -> list[Job]:
             progress.updated_s = now_s - 1790.0
         if steps:
             progress.state, progress.started_s = "running", now_s - 1800.0
+            progress.first_started_s = progress.started_s
             progress.slot = f"GPU 3 slot {job.number}"
     done = jobs[2].progress
     done.state, done.ended_s, done.slot, done.env_steps_per_s = "completed", now_s, "", 0.0
