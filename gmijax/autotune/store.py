@@ -23,7 +23,7 @@ from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.config.schema import require_positive
 from gmijax.errors import ConfigError, DamagedFile, GmijaxError
 from gmijax.runs.cache import cache_folder
-from gmijax.runs.folder import read_json, why_no_folder, write_json
+from gmijax.runs.folder import make_folder, read_json, write_json
 from gmijax.runs.names import nearby
 
 _DIGEST_LENGTH = 10
@@ -51,13 +51,7 @@ class ProfileStore:
         digest = hashlib.sha256(json.dumps(self._key, sort_keys=True).encode()).hexdigest()
         name = f"{_slug(key['device'])}-{_slug(key['task'])}-{digest[:_DIGEST_LENGTH]}.json"
         self.path = folder / name
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            # What stands there may be a file.
-            is_taken = isinstance(error, FileExistsError)
-            wrong = why_no_folder(folder) if is_taken else f"cannot be used ({error.strerror})"
-            raise ConfigError(f"search.store={folder}: {wrong}") from None
+        make_folder(folder, f"search.store={folder}")
         self._records = self._load()
 
     def kept_or(

@@ -20,7 +20,7 @@ from typing import Any, Final
 
 from gmijax.config.schema import flatten
 from gmijax.errors import ConfigError, DamagedFile
-from gmijax.runs.folder import no_folder_made, read_json, why_no_folder, write_json
+from gmijax.runs.folder import make_folder, read_json, write_json
 from gmijax.runs.names import nearby, shortened
 
 _DIGITS = 6
@@ -92,28 +92,20 @@ def open_dataset(paths: DataPaths, about: Mapping[str, Any]) -> None:
       ConfigError: the folder cannot be written, holds something else, or experience that was
         collected in another way.
     """
+    shown = f"output.dir={nearby(paths.root)}"
     try:
         if paths.dataset.exists():
             _check_same(paths, about)
-        elif paths.root.exists() and not paths.root.is_dir():
-            raise ConfigError(f"output.dir={nearby(paths.root)}: {why_no_folder(paths.root)}")
-        elif paths.root.exists() and any(paths.root.iterdir()):
+            return
+        make_folder(paths.root, shown)
+        if any(paths.root.iterdir()):
             raise ConfigError(
-                f"output.dir={nearby(paths.root)}: the folder is not empty and holds no "
-                f"experience ({paths.dataset.name} is missing)"
+                f"{shown}: the folder is not empty and holds no experience "
+                f"({paths.dataset.name} is missing)"
             )
-        else:
-            _make_folder(paths.root)
-            write_json(paths.dataset, about)
+        write_json(paths.dataset, about)
     except OSError as error:
-        raise ConfigError(f"output.dir={nearby(paths.root)}: {error.strerror}") from None
-
-
-def _make_folder(root: Path) -> None:
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"output.dir={nearby(root)}: {no_folder_made(error)}") from None
+        raise ConfigError(f"{shown}: {error.strerror}") from None
 
 
 def remove_begun(paths: DataPaths, num_simulators: int, *, is_new: bool) -> None:

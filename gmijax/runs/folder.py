@@ -180,12 +180,10 @@ def create_run(run_dir: str | None, name: str | None, prefix: str) -> RunPaths:
         # Two jobs started in the same second: only a name that we made up may be changed.
         candidate = root.with_name(f"{root.name}-{attempt}") if attempt and not given else root
         try:
-            candidate.mkdir(parents=True)
+            make_folder(candidate, shown, is_new=True)
         except FileExistsError:
             require_new_run(run_dir, name)
             continue
-        except OSError as error:
-            raise ConfigError(f"{shown}: {no_folder_made(error)}") from None
         return RunPaths(candidate.resolve())
     raise ConfigError(f"{shown}: no free name")
 
@@ -227,9 +225,26 @@ def why_no_folder(path: str | os.PathLike[str]) -> str:
     return "is not a folder" if os.path.exists(path) else "no such folder"
 
 
-def no_folder_made(error: OSError) -> str:
-    """What to say of a path at which no folder can be made."""
-    return f"cannot make the folder ({error.strerror})"
+def make_folder(path: Path, shown: str, *, is_new: bool = False) -> None:
+    """Makes a folder, and those above it; one that is there will do, unless `is_new`.
+
+    Args:
+      path: of the folder.
+      shown: the same in an error, with the key that the user gave.
+      is_new: see above.
+
+    Raises:
+      FileExistsError: something is there, with `is_new`.
+      ConfigError: it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=not is_new)
+    except FileExistsError:
+        if is_new:
+            raise
+        raise ConfigError(f"{shown}: {why_no_folder(path)}") from None
+    except OSError as error:
+        raise ConfigError(f"{shown}: cannot make the folder ({error.strerror})") from None
 
 
 def require_new_run(run_dir: str | None, name: str | None, hint: str = "") -> None:

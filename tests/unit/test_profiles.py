@@ -84,7 +84,7 @@ def test_a_broken_file_is_moved_aside_and_told(content: str, tmp_path: Path):
 
 def test_a_folder_that_cannot_be_used_is_bad_input(tmp_path: Path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"search\.store=.*file/x: cannot be used"):
+    with pytest.raises(ConfigError, match=r"search\.store=.*file/x: cannot make the folder \(Not"):
         store(tmp_path / "file" / "x")
     with pytest.raises(ConfigError, match=r"search\.store=.*file: is not a folder$"):
         store(tmp_path / "file")
