@@ -5,16 +5,15 @@ A child does it, `gmijax.workers.plain_playback`. No jax and no mujoco here.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Final
 
 from gmijax.config import PlayConfig
-from gmijax.config.schema import to_dict
+from gmijax.deploy.output import prepare_output
 from gmijax.deploy.pictures import run_child
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.opengl import NO_OPENGL, environment_with
 from gmijax.player.shipped import require_alone, require_shipped
-from gmijax.runs.folder import RUNS, PlayPaths, RunPaths, remove_temporary, write_json
+from gmijax.runs.folder import RUNS, PlayPaths
 from gmijax.runs.names import nearby
 from gmijax.supervise.failures import last_line
 
@@ -41,18 +40,11 @@ def folder_of(config: PlayConfig) -> PlayPaths:
     """`runs/shipped/<task>`, with the configuration and nothing of an earlier call.
 
     Raises:
-      ConfigError: it cannot be written.
+      ConfigError: as `prepare_output`.
     """
     paths = PlayPaths(RUNS / SHIPPED / str(config.run.env))
-    try:
-        paths.root.mkdir(parents=True, exist_ok=True)
-        write_json(RunPaths(paths.root).config, to_dict(config))
-        remove_temporary(paths.root)
-        for path in paths.results():
-            path.unlink(missing_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot write to {nearby(paths.root)} ({error.strerror})") from None
-    return PlayPaths(Path(paths.root).resolve())
+    prepare_output(paths.root, config, paths.results())
+    return PlayPaths(paths.root.resolve())
 
 
 def play(paths: PlayPaths, seconds: float | None = None) -> None:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from gmijax.config import EnvConfig, ExportConfig, PlayConfig, ViewConfig
-from gmijax.config.schema import to_dict
+from gmijax.deploy.output import prepare_output
 from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError
 from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of
-from gmijax.runs.folder import META, RunPaths, remove_temporary, write_json
+from gmijax.runs.folder import META, RunPaths
 from gmijax.runs.names import nearby, steps_name
 from gmijax.runs.ranking import choose_best, ranked
 from gmijax.runs.resume import (
@@ -126,17 +126,10 @@ def output_folder(
       stale: files that may be there from before, in such a folder; they are removed.
 
     Raises:
-      ConfigError: it cannot be written.
+      ConfigError: as `prepare_output`.
     """
     run = Path(str(config.run.dir))
     env_steps = CheckpointMeta.read(Path(str(config.checkpoint))).env_steps
     root = run / name / steps_name(env_steps)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        write_json(RunPaths(root).config, to_dict(config))
-        remove_temporary(root)
-        for path in stale(root):
-            path.unlink(missing_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot write to {nearby(root)} ({error.strerror})") from None
+    prepare_output(root, config, stale(root))
     return root

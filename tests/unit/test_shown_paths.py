@@ -50,8 +50,17 @@ def at_step_7(run: RunPaths) -> object:
     return checkpoint_of(build("play", PlayConfig, [f"run.dir={run.root}", "checkpoint=7"]))[0]
 
 
-def written_to(run: RunPaths) -> object:
+def not_made(run: RunPaths) -> object:
     (run.root / "play").touch()
+    return written_to(run)
+
+
+def not_written(run: RunPaths) -> object:
+    (run.root / "play" / "000000000100" / "config.json").mkdir(parents=True)
+    return written_to(run)
+
+
+def written_to(run: RunPaths) -> object:
     words = [f"run.dir={run.root}", f"checkpoint={run.checkpoint(100)}"]
     return output_folder(build("play", PlayConfig, words), "play")
 
@@ -69,7 +78,8 @@ def listed(run: RunPaths) -> object:
         (alone, "checkpoint td/checkpoints/000000000100: no config.json in td; "),
         (other, "td/config.json: not the configuration of a training run"),
         (at_step_7, "checkpoint=7: no such checkpoint in td; there are 100, 200"),
-        (written_to, "cannot write to td/play/000000000100 (Not a directory)"),
+        (not_made, "td/play/000000000100: cannot make the folder (Not a directory)"),
+        (not_written, "cannot write to td/play/000000000100 (Is a directory)"),
         (listed, "td/checkpoints: cannot be read (Too many levels"),
         (
             lambda run: CheckpointMeta.read(run.checkpoint(7)),
