@@ -18,9 +18,10 @@ class Rank(NamedTuple):
 
     One without an evaluation comes after all that have one. Its mean return in training counts
     after all those of full windows where its own window is not: at the start of a run it is of
-    short episodes alone.
+    short episodes alone. Those whose meta data cannot be read come last.
     """
 
+    is_read: bool
     is_evaluated: bool
     is_full: bool
     value: float
@@ -52,8 +53,8 @@ def choose_best(folder: Path) -> tuple[Path | None, tuple[str, ...]]:
     And what was passed over for it: better ones, and those whose rank cannot be read.
     """
     best, named = None, list[str]()
-    for _, path in ranked(checkpoints_of(folder)):
-        if best is not None and _meta_of(path) is not None:
+    for rank, path in ranked(checkpoints_of(folder)):
+        if best is not None and rank.is_read:
             continue
         if wrong := what_is_broken(path):
             named.append(passed_over(path, wrong))
@@ -80,13 +81,13 @@ def _meta_of(checkpoint: Path) -> CheckpointMeta | None:
 
 def _rank(meta: CheckpointMeta | None, lines: Sequence[Mapping[str, Any]]) -> Rank:
     if meta is None:
-        return Rank(False, False, -math.inf)
+        return Rank(False, False, False, -math.inf)
     if meta.eval_return is not None:
-        return Rank(True, True, meta.eval_return)
+        return Rank(True, True, True, meta.eval_return)
     is_full, mean = meta.window_full, meta.mean_return
     if meta.limit_steps is not None and (line := _a_limit_later(meta, lines)) is not None:
         is_full, mean = bool(line.get("window/full")), number_in(line, "window/return")
-    return Rank(False, is_full, -math.inf if mean is None else mean)
+    return Rank(True, False, is_full, -math.inf if mean is None else mean)
 
 
 def _a_limit_later(

@@ -23,7 +23,7 @@ from gmijax.runs.checkpoints import CheckpointMeta, checkpoints_of, newest_check
 from gmijax.runs.dataset import DataPaths
 from gmijax.runs.folder import META, RunPaths, write_json
 from gmijax.runs.names import attempt_folders, by_steps, gmi_folders, steps_name, steps_of
-from gmijax.runs.ranking import best_checkpoint, best_evaluation
+from gmijax.runs.ranking import best_checkpoint, best_evaluation, ranked
 from gmijax.runs.resume import choose_checkpoint, last_run
 
 COPIES = (
@@ -61,6 +61,11 @@ def test_copies_are_no_checkpoints(run: RunPaths):
     assert best_evaluation(run.root, 10**12) == float("-inf")
     # A copy can be named itself.
     assert choose_checkpoint(str(run.checkpoints / "best"), "x")[0].name == "best"
+
+
+def test_a_checkpoint_that_cannot_be_read_is_ranked_last(run: RunPaths):
+    (run.checkpoint(300) / META).write_text("{")
+    assert [int(path.name) for _, path in ranked(checkpoints_of(run.root))] == [200, 100, 300]
 
 
 def test_a_copy_under_the_name_of_other_steps_is_passed_over(run: RunPaths):
