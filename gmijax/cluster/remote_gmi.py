@@ -122,6 +122,11 @@ class RemoteGmi(WatchedGmi):
         self._log_bytes = 0
 
     @property
+    def process_name(self) -> str:
+        """See `WatchedGmi`; the number means nothing on another machine."""
+        return f"{self.pid} of node {self._node.address}"
+
+    @property
     def error(self) -> ReportedError | None:
         """See `WatchedGmi`."""
         return self._error

@@ -107,7 +107,7 @@ class Supervisor:
             self._raise_failure()
         except BaseException as error:
             if left := self._end_all():
-                error.add_note(f"processes {left} do not end: a driver may hold them")
+                error.add_note(f"processes {', '.join(left)} do not end: a driver may hold them")
                 if isinstance(error, GmiFailed):
                     error.is_final = True  # Nothing may be started beside them.
             raise
@@ -251,7 +251,7 @@ class Supervisor:
                 if now[process] == sizes[process] or now[process] != before
             }
 
-    def _end_all(self) -> list[int]:
+    def _end_all(self) -> list[str]:
         """Ends every process that is left: backend, order to end, grace, SIGKILL, lifeline.
 
         Returns:
@@ -270,7 +270,7 @@ class Supervisor:
         alive = _wait_for_end(alive, _KILL_WAIT_S)
         for process in self._started.values():
             process.close()
-        return [process.pid for process in alive]
+        return [process.process_name for process in alive]
 
 
 def _wait_for_end(processes: Sequence[WatchedGmi], timeout_s: float) -> list[WatchedGmi]:

@@ -59,6 +59,11 @@ class WatchedGmi(ABC):
         self._was_ready = False
 
     @property
+    def process_name(self) -> str:
+        """Its process, for the user."""
+        return str(self.pid)
+
+    @property
     def is_ready(self) -> bool:
         """Whether the GMI has once been ready, or has ended well without saying so."""
         return self._was_ready or self.exit_code == 0

@@ -14,7 +14,7 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
-from supervision import gpus_of_nodes, machine, make_launch, plan_on
+from supervision import gpus_of_nodes, machine, make_launch, plan_on, planned
 
 from gmijax import compose
 from gmijax.cluster import node as nodes
@@ -47,6 +47,8 @@ from gmijax.errors import (
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import GmiPaths, RunPaths
+from gmijax.supervise import supervisor
+from gmijax.supervise.backends import open_backend
 from gmijax.supervise.failures import describe_exit, first_cause, is_consequence
 from gmijax.supervise.heartbeat import Heartbeat
 from gmijax.supervise.job_kinds import JobKind
@@ -356,6 +358,30 @@ def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
     assert not is_consequence(failure)
     assert gmi.request_stacks() is None
     gmi.kill()
+
+
+def test_a_process_that_does_not_end_is_named_with_its_node(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "_KILL_WAIT_S", 0.0)
+    run, here = RunPaths(tmp_path), machine(0)
+    plan = planned(here, gmis_per_gpu=1)
+    running = RemoteGmiStatus(None, 1, Heartbeat("running", 7, 99), None, 0)
+    node = a_node(start=99, poll={0: running})
+
+    def stop(_: Any) -> None:
+        raise JobInterrupted("stopped")
+
+    supervised = supervisor.Supervisor(
+        make_launch(run, ["train"], plan, grace=0.01),
+        open_backend(plan, here, run),
+        start=lambda gmi: node.start(gmi, run.gmi(gmi)),
+    )
+    with pytest.raises(JobInterrupted) as error:
+        supervised.run(stop)
+    assert error.value.__notes__ == [
+        "processes 99 of node 10.0.0.2 do not end: a driver may hold them"
+    ]
 
 
 def test_an_error_of_a_node_is_no_lost_node(tmp_path: Path) -> None:
