@@ -46,7 +46,12 @@ _MOST_SHOWN = 4
 
 @dataclass(frozen=True)
 class PackWork(Work[CommandJob]):
-    """Commands; see `Work`."""
+    """Commands; see `Work`.
+
+    Attributes:
+      limiters: what limits the slots of a run, once it has begun: the report is made before, and
+        tells its decisions. The only thing here that changes.
+    """
 
     name = "pack"
     resume_requirement = "command and lists"
