@@ -8,6 +8,7 @@ import re
 import shlex
 import unicodedata
 from collections.abc import Sequence
+from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, Quote, QuotedString
@@ -15,7 +16,7 @@ from hydra.errors import HydraException
 
 from gmijax.cli.groups import choices
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import RUNS
+from gmijax.runs.folder import RUNS, RunPaths
 
 _MOST_VALUES = 2000
 """In one argument."""
@@ -107,7 +108,7 @@ def _meant(word: str) -> str:
     """The key that a word alone, e.g. `ant`, may be a value of."""
     if re.search(r"\.py(:|$)", word):
         return f"; did you mean env={word}?"
-    if word == "last" or "/" in word:
+    if word == "last" or "/" in word or os.path.isfile(RunPaths(Path(word)).config):
         return f"; did you mean run.dir={word}?"
     if difflib.get_close_matches(word, ("help",), cutoff=0.7):
         return "; did you mean --help?"

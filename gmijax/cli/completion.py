@@ -11,7 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 from gmijax.cli.answers import own_answers
 from gmijax.cli.groups import config_dir
 from gmijax.control.exit_codes import exit_code_of
-from gmijax.control.output import write_output
+from gmijax.control.output import as_output, write_output
 from gmijax.errors import ConfigError
 
 
@@ -46,6 +46,7 @@ def _complete(argv: Sequence[str], verbs: Iterable[str]) -> None:
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
         try:
-            hydra.shell_completion(name, list(argv))
+            with as_output():
+                hydra.shell_completion(name, list(argv))
         except ValueError as error:
             raise ConfigError(f"-sc {' '.join(argv)}: {' '.join(str(error).split())}") from None

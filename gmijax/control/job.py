@@ -91,6 +91,8 @@ def train(config: TrainConfig, *, show: Show = False) -> Result:
     opengl = None if start_point.is_complete else find_opengl(config)
     console = open_console(show=show)
     if start_point.is_complete and start_point.folder is not None:
+        for note in start_point.notes:
+            console.print(note)
         return _finished(config, start_point.folder, console)
     if start_point.checkpoint is not None and (notice := source.executed(config.env)):
         console.print(notice)

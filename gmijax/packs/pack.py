@@ -238,16 +238,18 @@ def pack_of(
         return CommandJob(number, dict(chosen), tuple(command), settings.total_steps)
 
     nodes = cluster or ClusterConfig()
+    names = {name: _shown(values) for name, values in space.items()}
+    lists = " ".join(f"{name}={values}" for name, values in names.items())
     if settings.commands is not None:
         if command or space:
-            raise ConfigError("pack.commands: not with a grid or a command after --")
+            own = lists or "a command after --"
+            raise ConfigError(f"pack.commands={settings.commands}: not with {own}")
         jobs = jobs_of_file(settings)
         return PackWork(settings, {}, make_job, jobs, nodes, folder)
     if not command:
         raise ConfigError("no command: expected gmijax pack [NAME=VALUE,VALUE ...] -- COMMAND ...")
     if settings.copies is not None and space:
-        raise ConfigError("pack.copies: not with a grid; leave out one of them")
-    names = {name: _shown(values) for name, values in space.items()}
+        raise ConfigError(f"pack.copies={settings.copies}: not with {lists}; leave one out")
     require_names([*command, *templates_of(settings)], names)
     if empty := [key for key, values in space.items() if values == Choices(())]:
         raise ConfigError(f"{empty[0]}: an empty list")

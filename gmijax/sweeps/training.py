@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
@@ -27,6 +28,9 @@ MODULE: Final = "gmijax.workers.training_job"
 
 _KILL_AFTER_S: Final = 15.0
 """Beyond what a job gives its GMIs to save and end."""
+
+_ENDS_IF_ASKED: Final = (EXIT_INTERRUPTED, -signal.SIGINT, -signal.SIGTERM)
+"""A controller that still starts, or ends, does not yet, or no longer, hear the signal."""
 
 _ENDED_BY_GPU: Final = ("mps", "mig")
 """Backends where a fault of one job can end another."""
@@ -87,7 +91,7 @@ class TrainingKind:
             return self._failed(running, job, own.error) if own.error else JobOutcome()
         if seen.exit_code == 0 and not are_several:
             return JobOutcome()
-        was_asked = seen.exit_code == EXIT_INTERRUPTED and running.is_asked
+        was_asked = running.is_asked and seen.exit_code in _ENDS_IF_ASKED
         if running.ended_by_shutdown or was_asked or (running.kill_sent and running.is_asked):
             return JobOutcome(is_interrupted=True)
         if seen.exit_code is None:

@@ -307,6 +307,7 @@ def test_a_file_in_place_of_a_run_folder_is_said_to_be_no_folder(
     ("word", "hint"),
     [
         ("ball", "; did you mean run.dir=runs/ball?"),
+        ("here", "; did you mean run.dir=here?"),
         ("ant", "; did you mean env=ant?"),
         ("..", ""),
         (LONG, ""),
@@ -315,6 +316,8 @@ def test_a_file_in_place_of_a_run_folder_is_said_to_be_no_folder(
 def test_a_word_that_names_a_run_is_taken_for_it(word: str, hint: str, tmp_path: Path) -> None:
     for name in ("ball", "ant"):
         (tmp_path / "runs" / name).mkdir(parents=True)
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "config.json").write_text("{}")
     done = run("play", word, cwd=tmp_path)
     assert done.stderr == f"gmijax.play: {word}: expected key=value{hint}\n"
 

@@ -72,6 +72,8 @@ def test_a_reader_that_is_gone_does_not_end_the_job(tmp_path: Path, shell: str):
         ("list-envs", "gmijax.list_envs", ""),
         ("doctor --help", "gmijax.doctor", "1"),
         ("--version", "gmijax", ""),
+        ("-sc install=bash", "gmijax.completion", "1"),
+        ("-sc install=bash", "gmijax.completion", ""),
     ],
 )
 def test_a_command_that_cannot_print_its_answer_has_failed(

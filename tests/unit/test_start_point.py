@@ -79,6 +79,19 @@ def test_auto_goes_on_from_the_newest_checkpoint_that_is_whole(run: RunPaths):
     assert find_start_point(config_of(run.root, "num_timesteps=100")).is_complete
 
 
+def test_a_run_that_is_complete_says_what_differs_and_what_is_damaged(
+    run: RunPaths, capsys: pytest.CaptureFixture[str]
+):
+    save(run, 100)
+    (save(run, 200) / META).write_text("{")
+    write_json(run.summary, {"status": "completed"})
+    gmijax.train(config_of(run.root, "num_timesteps=100", "num_envs=8"), show=True)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "000000000200: passed over" in said
+    assert "changed since the run: num_envs is 8, was" in said
+    assert said.index("num_envs is 8") < said.index("this run is complete already")
+
+
 @pytest.mark.parametrize("named", ["run.name=5", "run.dir=runs/5", "run.name='5'"])
 def test_a_run_whose_name_is_a_number_keeps_its_settings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str

@@ -145,6 +145,21 @@ def test_jobs_are_asked_once_and_once_more_if_it_becomes_urgent(
     assert sweep.states() == ["interrupted"]
 
 
+@pytest.mark.parametrize(
+    ("exit_code", "state"),
+    [(-signal.SIGINT, "interrupted"), (-signal.SIGTERM, "interrupted"), (-9, "waiting")],
+)
+def test_a_controller_that_is_asked_before_it_hears_signals_is_interrupted(
+    exit_code: int, state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep, signals = Sweep(tmp_path, jobs(1)), StopSignals()
+    orders_of(sweep, monkeypatch, deaf_to=("interrupt", "ask_to_stop"))
+    end = partial(sweep.nodes[0].end, exit_code)
+    with pytest.raises(JobInterrupted):
+        sweep.run(partial(signals.handle, signal.SIGINT), end, signals=signals)
+    assert sweep.states() == [state]
+
+
 def test_jobs_that_cannot_be_ranked_are_ended_at_their_first_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
