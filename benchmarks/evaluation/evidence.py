@@ -36,10 +36,12 @@ class Evidence(NamedTuple):
     Attributes:
       repeats: runs of the case that ran least often.
       sources: of all of them.
+      unit: what was repeated.
     """
 
     repeats: int
     sources: frozenset[Source] = frozenset()
+    unit: str = "run"
 
     @property
     def has_origin(self) -> bool:
@@ -54,7 +56,7 @@ class Evidence(NamedTuple):
     def __str__(self) -> str:
         gpus = sorted({one.gpu for one in self.sources if one.gpu})
         unknown = [] if self.has_origin else ["commit unknown"]
-        return ", ".join([" and ".join(gpus) or "CPU", counted(self.repeats, "run"), *unknown])
+        return ", ".join([" and ".join(gpus) or "CPU", counted(self.repeats, self.unit), *unknown])
 
 
 class Ratio(float):

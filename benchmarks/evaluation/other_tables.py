@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from benchmarks.evaluation.evidence import Evidence, Ratio, Said, source
@@ -123,10 +124,20 @@ def model_fit() -> Said:
     return said_bounds(fits, ".3g")
 
 
+FAULTS = MappingProxyType(
+    {
+        "oom": "a GMI runs out of GPU memory",
+        "stuck": "a GMI hangs",
+        "daemon": "the MPS daemon dies",
+        "kill": "`kill -9` of a GMI",
+    }
+)
+
+
 @table("faults", "fault | seconds until all GMIs train again:", "faults-h200")
 def faults() -> Rows:
     """Seconds from a fault until all GMIs train again."""
-    return [[kind, shown(found, ".0f")] for kind, found in seconds_to_recover().items()]
+    return [[FAULTS[kind], shown(found, ".0f")] for kind, found in seconds_to_recover().items()]
 
 
 def seconds_to_recover() -> dict[str, Figure | None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -59,7 +60,7 @@ def _of_trainings() -> Calls:
 
 @table_of_calls(
     "packs",
-    "training | at once | steps/s while all report: | over one: | trainings per hour: | "
+    "training | at once | steps/s in all: | over one: | trainings per hour: | "
     "over one: | reward at the end:",
     _of_trainings,
     lambda training: training,
@@ -81,7 +82,18 @@ def packs(calls: Calls) -> Rows:
                 shown(training.over_one(way, _FINISHED)),
                 shown(training.last_metric(way), ".1f") if has_curves else "",
             ]
-            yield ["" if number else name, way, *(["", ""] if is_mix else cells[:2]), *cells[2:]]
+            if is_mix:
+                cells[:2] = "", ""
+            yield ["" if number else name, _shown_way(way), *cells]
+
+
+def _shown_way(way: str) -> str:
+    """`3, one after another, mps` of `1 of 3 at once, mps`, and so for `auto`."""
+    found = re.fullmatch(r"(1|auto) of (\d+) at once, (\w+)", way)
+    if found is None:
+        return way
+    at_once, copies, backend = found.groups()
+    return f"{copies}, " + (f"one after another, {backend}" if at_once == "1" else "by `auto`")
 
 
 def eight_packed(name: str) -> dict[str, Ratio | None]:

@@ -9,9 +9,14 @@ from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 from benchmarks.evaluation import claims, learning_tables, seed_tables  # noqa: F401
-from benchmarks.evaluation.async_tables import asynchronous_gains, beside_a_learner
+from benchmarks.evaluation.async_tables import (
+    SECONDS,
+    asynchronous_gains,
+    beside_a_learner,
+    learners_over_one,
+)
 from benchmarks.evaluation.evidence import Ratio, Said
-from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, Figure, said, said_bounds
+from benchmarks.evaluation.figures import TRAINING, Figure, said, said_bounds
 from benchmarks.evaluation.learning_tables import seconds_to_mark
 from benchmarks.evaluation.other_tables import seconds_to_recover
 from benchmarks.evaluation.pack_tables import CLEANRL, MJLAB, eight_packed
@@ -45,10 +50,11 @@ def gains() -> dict[str, Gains]:
         "fixed_total": {STEPS: [*fixed_total_ratios().values()]},
         "best_plans": {STEPS: [*best_plan_ratios().values()]},
         "two_gpus": {STEPS: [over_one_gpu()]},
+        "two_gpus_sac": {STEPS: [learners_over_one()]},
         **{
             f"asynchronous_{gpus}": {
                 STEPS: asynchronous_gains(gpus, TRAINING),
-                FINISHED: asynchronous_gains(gpus, WHOLE_RUN),
+                FINISHED: asynchronous_gains(gpus, SECONDS),
             }
             for gpus in (1, 2)
         },
@@ -81,10 +87,10 @@ def front() -> Values:
         "cleanrl": {key: said(gain) for key, gain in eight_packed(CLEANRL).items()},
         "over_brax": said_bounds(beside),
         "comparisons": Said(str(len(beside)), None),
-        "kill": said(_brief(seconds_to_recover().get("kill")), ".0f"),
+        "kill": said(_brief(seconds_to_recover().get("kill"), "kill"), ".0f"),
     }
 
 
-def _brief(found: Figure | None) -> Ratio | None:
-    """Only its median; how many runs it is of stands beside it."""
-    return found and Ratio(found.median, found.evidence)
+def _brief(found: Figure | None, unit: str = "run") -> Ratio | None:
+    """Only its median; how many runs, or what `unit` says, it is of stands beside it."""
+    return found and Ratio(found.median, found.evidence._replace(unit=unit))

@@ -62,8 +62,8 @@ SUMMARY = MappingProxyType(
         "8 trainings in 8 processes, over one program": {"program": "8 of ant"},
         "one training in several GMIs, over one process": {
             "off_policy": "SAC, agent + learner",
-            "best_plans": "PPO, each at its best",
-            "fixed_total": "PPO, same environments",
+            "best_plans": "PPO, 65,536 environments",
+            "fixed_total": "PPO, 8,192 environments",
         },
         "agents and trainers apart, over synchronous": {
             "asynchronous_1": "one GPU",

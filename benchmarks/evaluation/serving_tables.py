@@ -144,7 +144,7 @@ def _of_both_templates() -> Iterator[tuple[Case, Evidence]]:
 @table_of_calls(
     "backends",
     "task | MJX | GMIs x environments | `mps`, steps/s: | `share`, steps/s: | ratio: | "
-    "over one process:",
+    "over one process under MPS:",
     _of_backends,
 )
 def backends(_: Calls) -> Rows:
