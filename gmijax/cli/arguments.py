@@ -15,6 +15,7 @@ from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException
 
 from gmijax.cli.groups import choices
+from gmijax.config.schema import close_name
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RUNS, RunPaths
 
@@ -115,8 +116,8 @@ def _meant(word: str) -> str:
     groups = {name: group for group in ("env", "algo") for name in choices(group)}
     if word not in (*groups, ".", "..") and os.path.isdir(RUNS / word):
         return f"; did you mean run.dir={RUNS / word}?"
-    close = difflib.get_close_matches(word, groups, n=1)
-    return f"; did you mean {groups[close[0]]}={close[0]}?" if close else ""
+    close = close_name(word, groups)
+    return f"; did you mean {groups[close]}={close}?" if close else ""
 
 
 def _unreadable(text: str, error: HydraException) -> ConfigError:

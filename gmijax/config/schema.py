@@ -190,8 +190,16 @@ def flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def suggestion(key: str, allowed: typing.Iterable[str]) -> str:
     """`: did you mean ...` where a name is close, else `; allowed: ...`."""
     names = sorted(allowed)
-    close = difflib.get_close_matches(key, names, n=1)
-    return f": did you mean {close[0]}?" if close else f"; allowed: {', '.join(names) or 'none'}"
+    if close := close_name(key, names):
+        return f": did you mean {close}?"
+    return f"; allowed: {', '.join(names) or 'none'}"
+
+
+def close_name(word: str, names: typing.Iterable[str]) -> str | None:
+    """The one of the names that a word may mean, in capitals or not."""
+    of_small = {name.lower(): name for name in names}
+    close = difflib.get_close_matches(word.lower(), of_small, n=1)
+    return of_small[close[0]] if close else None
 
 
 def _has_default(cls: Any, key: str) -> bool:

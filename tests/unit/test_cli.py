@@ -34,6 +34,12 @@ APART = "plan.serving_gpus, plan.training_gpus: GPUs [1] both act and train and 
 REFUSED: list[tuple[str, str, str]] = [
     # Keys and options that are not there.
     ("train", "env=antt", "env=antt: unknown task: did you mean ant?"),
+    ("train", "env=ANT", "env=ANT: unknown task: did you mean ant?"),
+    ("train", "ANT", "ANT: expected key=value; did you mean env=ant?"),
+    ("TRAIN", "", "gmijax: unknown command 'TRAIN': did you mean train?"),
+    ("play", "--help RUN", "--help RUN: no such topic: did you mean run?"),
+    ("train", "run.resume=AUTO", "run.resume=AUTO: no such folder; did you mean auto?"),
+    ("play", "run.dir=LAST", "run.dir=LAST: no such folder; did you mean last?"),
     ("train", "env=brax:ant", "unknown task: did you mean env=brax env.name=ant?"),
     ("sweep", "env=playground:Go1Getup", "did you mean env=playground env.name=Go1Getup?"),
     ("train", "algo=td3", "algo=td3: unknown algorithm: expected one of a3c, distill, ppo, sac"),
