@@ -102,7 +102,7 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
         at = arguments.index("--cfg")
         if arguments[at + 1 : at + 2] != ["job"]:
             given = [text for text in arguments[at : at + 2] if "=" not in text]
-            raise ConfigError(f"{' '.join(given)}: allowed: job")
+            raise ConfigError(f"{' '.join(given)}: expected --cfg job")
         del arguments[at : at + 2]
         show = True
     for text, after in zip_longest(arguments, arguments[1:], fillvalue="-"):
