@@ -39,7 +39,7 @@ from gmijax.runs.saved_config import (
 )
 from gmijax.sim.registry import SUITES
 from gmijax.sim.robots import robot_name
-from gmijax.sim.source import reference
+from gmijax.sim.source import names_file, no_reference, reference
 
 C = TypeVar("C")
 
@@ -232,6 +232,8 @@ def _check_override(name: str, item: Override) -> None:
         if key == "env" and colon and suite in options:  # As labels and run folders have it.
             hint = f": did you mean env={suite} env.name={of_suite}?"
         raise ConfigError(
+        elif key == "env" and names_file(str(item.value())):
+            raise no_reference(str(item.value()))
             f"{key}={item.value()}: unknown{kind}{hint or suggestion(str(item.value()), options)}"
         )
 

@@ -192,6 +192,11 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "env=ant env.randomization.body_mass.operation=x", "expected one of scale, add"),
     ("train", "env=ant +env.randomization.body_mas={operation:set,range:[1,2]}", "body_mass?"),
     # Plans and reductions.
+    *(
+        (command, f"env={name}", f"env={name}: expected PATH.py:FUNCTION, e.g. path/to/cart.py:m")
+        for command in ("train", "sweep", "play", "export", "view")
+        for name in ("base/config.json:make", "cart:make", "cart.pyc", "./cart")
+    ),
     ("train", "plan.backend=mps", "plan.backend=mps"),
     ("train", "plan.backend=mig", "plan.backend=mig"),
     ("train", "plan.backend=share", "plan.backend=share"),
