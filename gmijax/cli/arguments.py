@@ -129,7 +129,15 @@ def _unreadable(text: str, error: HydraException) -> ConfigError:
         return ConfigError(f"{text}: a name is missing before or after a dot of the key")
     if function := re.search(r"while evaluating .*", str(error)):
         return ConfigError(f"{text}: {function[0]}")
-    text_of_it = f"{key}={quoted(value)}"
-    special = set(text_of_it) & set('"\\$`!')
-    shell = shlex.quote(text_of_it) if special else f'"{text_of_it}"'
+    if unclosed := re.fullmatch(r"""(['"])[^'"]+|[^'"]+(['"])""", value):
+        closed = _for_shell(f"{key}={quoted(value.strip(unclosed[1] or unclosed[2]))}")
+        return ConfigError(f"{text}: a quote is missing; text in quotes: {closed}")
+    shell = _for_shell(f"{key}={quoted(value)}")
     return ConfigError(f"{text}: not a value; text with such characters needs quotes: {shell}")
+
+
+def _for_shell(word: str) -> str:
+    """A word as people would type it; `shlex.quote` takes its single quotes to pieces."""
+    if set(word) & set("$`!"):  # A shell reads these within double quotes.
+        return shlex.quote(word)
+    return '"' + re.sub(r'("|\\(?=["\\]))', r"\\\1", word) + '"'

@@ -280,6 +280,10 @@ REFUSED: list[tuple[str, str, str]] = [
         """run.name=ünder: not a value; text with such characters needs""",
     ),
     ("train", "run.name=int([)", "run.name=int([): not a value"),
+    ("train", "run.dir='a", """a quote is missing; text in quotes: "run.dir='a'\"\n"""),
+    ("play", 'run.dir="a', """a quote is missing; text in quotes: "run.dir='a'\"\n"""),
+    ("train", "run.name=a'", """a quote is missing; text in quotes: "run.name='a'\"\n"""),
+    ("train", "run.dir=it's", """needs quotes: "run.dir='it\\'s'\"\n"""),
     ("train", "seed=int(x)", "seed=int(x): while evaluating 'int(x)': invalid literal"),
     ("train", "é=1", "é=1: expected key=value"),
     (
@@ -355,7 +359,13 @@ def test_the_home_folder_is_no_folder_of_that_name(text: str, monkeypatch: pytes
     assert compose("env=~/task.py:make").env.name == "/home/it's (one)/task.py:make"
 
 
-@pytest.mark.parametrize("value", ["lr=3e-4,h=64", "runs/(v2)", "ünder", "it's", "a\\'b", "[1"])
+@pytest.mark.parametrize(
+    "value",
+    [
+        *("lr=3e-4,h=64", "runs/(v2)", "ünder", "it's", "a\\'b", "[1", "$HOME's", "`(x", 'a"[b'),
+        *("a\\\\'b", "(it's!", "'a' b", "\\$(x)", '"a" b', "(\\"),
+    ],
+)
 def test_text_in_quotes_is_taken_as_the_message_says(value: str):
     with pytest.raises(ConfigError, match="needs quotes: ") as refused:
         compose(f"run.name={value}")
