@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import json
 import re
 import sys
 import types
@@ -212,7 +213,7 @@ def convert(kind: Any, value: Any, key: str) -> Any:
     trees: list[Any] = [x for x in _options(kind) if dataclasses.is_dataclass(x)]
     if trees:
         if not isinstance(value, Mapping):
-            raise ConfigError(f"{key}={value!r}: expected a group of keys")
+            raise ConfigError(f"{key}={_shown(value)}: expected a group of keys")
         if len(trees) > 1:
             return from_named(trees, value, f"{key}.")
         return from_dict(trees[0], value, f"{key}.")
@@ -317,4 +318,7 @@ def _describe(kind: Any) -> str:
 
 
 def _shown(value: Any) -> str:
+    """As plain data has it: `null` and `true`, which Python calls otherwise."""
+    if value is None or isinstance(value, bool):
+        return json.dumps(value)
     return str(value) if isinstance(value, str) else repr(value)

@@ -138,7 +138,14 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "num_envs=3 algo.unroll_length=1", "do not divide into algo.num_minibatches=4"),
     ("train", "seed=range(1,3)", "seed=range(1,3): expected one value"),
     ("train", "plan.gpus=0,1", "plan.gpus=0,1: expected one value (a list "),
-    ("train", "run=null", "run=None: expected a group of keys"),
+    ("train", "run=null", "run=null: expected a group of keys"),
+    ("play", "run.dir=true", "run.dir=true: expected text or null"),
+    ("serve", "run.dir=true", "run.dir=true: expected text or null"),
+    ("train", "run.resume=false", "run.resume=false: expected text or null"),
+    ("search", "run.resume=true", "run.resume=true: expected text or null"),
+    ("train", "run.resume=5.5", "run.resume=5.5: expected text or null"),
+    ("train", "num_envs=true", "num_envs=true: expected an integer or auto"),
+    ("play", "video=true", "video=true: expected one of auto, mp4"),
     ("train", "run.dir={1:2}", "run.dir={1: 2}: expected text or null"),
     ("train", "algo.learning_rate=inf", "algo.learning_rate=inf: expected a finite number"),
     ("train", "algo.desired_kl=nan", "algo.desired_kl=nan: expected a finite number"),
@@ -185,6 +192,11 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "env=ball_balance env.name=ant", "choose the task with env=ant"),
     ("train", "env=brax", "env.name: must be given with env=brax, e.g. env.name=ant"),
     ("train", "env=nowhere.py:make", "env=nowhere.py:make: no such file"),
+    *(
+        (command, f"env={name}", f"env={name}: expected PATH.py:FUNCTION, e.g. path/to/cart.py:m")
+        for command in ("train", "sweep", "play", "export", "view")
+        for name in ("base/config.json:make", "cart:make", "cart.pyc", "./cart")
+    ),
     ("train", "env=nowhere.py", "env=nowhere.py: expected PATH.py:FUNCTION"),
     ("train", f"env={LONG}.py:f", "a.py:f: no such file"),
     ("train", "env=ant env.randomize=maybe", "env.randomize=maybe: expected one of off, on, epi"),
@@ -192,11 +204,6 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "env=ant env.randomization.body_mass.operation=x", "expected one of scale, add"),
     ("train", "env=ant +env.randomization.body_mas={operation:set,range:[1,2]}", "body_mass?"),
     # Plans and reductions.
-    *(
-        (command, f"env={name}", f"env={name}: expected PATH.py:FUNCTION, e.g. path/to/cart.py:m")
-        for command in ("train", "sweep", "play", "export", "view")
-        for name in ("base/config.json:make", "cart:make", "cart.pyc", "./cart")
-    ),
     ("train", "plan.backend=mps", "plan.backend=mps"),
     ("train", "plan.backend=mig", "plan.backend=mig"),
     ("train", "plan.backend=share", "plan.backend=share"),
@@ -273,6 +280,10 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "\r", r"'\r': expected text without control characters"),
     ("train", "run.name=lr=3e-4", "run.name=lr=3e-4: not a value; text with such characters"),
     ("train", "run.dir=runs/(v2)", """needs quotes: "run.dir='runs/(v2)'\""""),
+    ("train", "run.dir='a", """a quote is missing; text in quotes: "run.dir='a'\"\n"""),
+    ("play", 'run.dir="a', """a quote is missing; text in quotes: "run.dir='a'\"\n"""),
+    ("train", "run.name=a'", """a quote is missing; text in quotes: "run.name='a'\"\n"""),
+    ("train", "run.dir=it's", """needs quotes: "run.dir='it\\'s'\"\n"""),
     ("play", "run.dir=a[b", """needs quotes: "run.dir='a[b'\""""),
     (
         "train",
@@ -280,10 +291,6 @@ REFUSED: list[tuple[str, str, str]] = [
         """run.name=ünder: not a value; text with such characters needs""",
     ),
     ("train", "run.name=int([)", "run.name=int([): not a value"),
-    ("train", "run.dir='a", """a quote is missing; text in quotes: "run.dir='a'\"\n"""),
-    ("play", 'run.dir="a', """a quote is missing; text in quotes: "run.dir='a'\"\n"""),
-    ("train", "run.name=a'", """a quote is missing; text in quotes: "run.name='a'\"\n"""),
-    ("train", "run.dir=it's", """needs quotes: "run.dir='it\\'s'\"\n"""),
     ("train", "seed=int(x)", "seed=int(x): while evaluating 'int(x)': invalid literal"),
     ("train", "é=1", "é=1: expected key=value"),
     (
