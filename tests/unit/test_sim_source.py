@@ -121,6 +121,8 @@ def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pyte
         ("return Env(SPEC", "return Env(None", r"spec: expected an EnvSpec, got NoneType"),
         ("return Env(", "return (", r"expected a gmijax\.sim\.interface\.Env, got tuple$"),
         ('"point", 2', '"point", 0', r"spec\.obs_size=0: must be an integer of at least 1$"),
+        ("0.1,", "0.0,", r"spec\.control_dt_s=0\.0: must be a number of seconds greater than 0$"),
+        ("0.1,", "'fast',", r"spec\.control_dt_s='fast': must be a number of seconds greater th"),
         ('"point", 2', '"point", 3', r"obs is float32\[2\], not float32\[3\]$"),
         (
             "state, moved,",
