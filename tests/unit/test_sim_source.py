@@ -35,6 +35,10 @@ def make(*, impl, max_envs):
     return Env(SPEC, (), reset, step, None, lambda state: state.physics)
 """
 
+READS_MODEL = """from mujoco import MjModel
+    MjModel.from_xml_string("<mujoco>{}</mujoco>")
+    return Env("""
+
 
 def written(folder: Path, text: str) -> str:
     (folder / "point.py").write_text(text)
@@ -110,6 +114,16 @@ def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pyte
             "return Env(",
             "assert False\n    return Env(",
             r"fails: AssertionError \(.*point\.py:\d+\)$",
+        ),
+        (
+            "return Env(",
+            READS_MODEL.format("<optoin/>"),
+            r"unrecognized element; Element 'optoin', line 1 \(.*point\.py:\d+\)$",
+        ),
+        (
+            "return Env(",
+            READS_MODEL.format("<a>"),
+            r"ValueError: XML parse error \d+: .*MISMATCHED.* \(.*point\.py:\d+\)$",
         ),
         ("def make(", "def make(:", r"point\.py fails: SyntaxError: .*line 8\)$"),
         (

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.errors import ConfigError, with_type
+from gmijax.errors import ConfigError, gist_of, with_type
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.types import PyTree
 
@@ -113,9 +113,8 @@ def attempt(what: str, function: Callable[..., Any], *arguments: Any, **named: A
     except ConfigError:
         raise
     except (Exception, SystemExit) as error:
-        lines = str(error).strip().splitlines() or [""]
         found = f"; {_FOUND}" if isinstance(error, ModuleNotFoundError) else ""
-        message = with_type(type(error).__name__, lines[0])
+        message = with_type(type(error).__name__, gist_of(str(error)))
         raise ConfigError(f"{what} fails: {message}{_line_of(error)}{found}") from error
 
 
