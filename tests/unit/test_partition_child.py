@@ -107,6 +107,11 @@ def test_an_error_of_any_length_fits(block: tuple[int, HeartbeatBlock]):
     assert error is not None
     assert len(error.message) == 2000
     assert error.missing == tuple(range(10_000, 10_200))
+    lines = ["Traceback (most recent call last):", *["  File x"] * 1_000, "ZeroDivisionError: y"]
+    block[1].write_error(ReportedError("E", "\n".join(lines), ""))
+    error = block[1].read_error()
+    assert error is not None
+    assert error.message == f"{lines[0]} {lines[-1]}"
 
 
 _STACKS = """Fatal Python error: Aborted
