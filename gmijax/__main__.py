@@ -45,7 +45,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         from gmijax.config.schema import suggestion
 
-        sys.stderr.write(f"gmijax: unknown command {verb!r}{suggestion(verb, (*VERBS, 'help'))}\n")
+        known = suggestion(verb, (*VERBS, "help"))
+        what = f"unknown command {verb!r}{known}"
+        if verb.startswith("-"):
+            what = f"unknown option {verb}; allowed: --help, --version, -sc, or a command"
+        sys.stderr.write(f"gmijax: {what}\n")
         return 2
     try:
         return importlib.import_module(f"gmijax.{verb.replace('-', '_')}").main(rest)

@@ -21,6 +21,7 @@ from gmijax.control.output import write_output
 from gmijax.deploy import shipped
 from gmijax.deploy.pictures import film
 from gmijax.deploy.shipped import SHIPPED
+from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.player.shipped import shipped_tasks
 from gmijax.runs.folder import RunPaths, read_json
@@ -46,7 +47,13 @@ def main(argv: Sequence[str]) -> int:
     """Runs the command; returns the exit code."""
     if "--help" in argv or "-h" in argv:
         return exit_code_of("demo", lambda: write_output(USAGE))
-    return exit_code_of("demo", lambda: demo(argv))
+    return exit_code_of("demo", lambda: _demo(argv))
+
+
+def _demo(argv: Sequence[str]) -> None:
+    if options := [text for text in argv if text.startswith("-")]:
+        raise ConfigError(f"unknown option {options[0]}; allowed: --help, key=value")
+    demo(argv)
 
 
 def demo(overrides: Sequence[str]) -> None:

@@ -48,6 +48,17 @@ def lines_of(error: BaseException) -> list[str]:
     return [line for line in lines if line] or [type(error).__name__]
 
 
+def gist_of(text: str) -> str:
+    """What a message of several lines says: its first line, and the last if that announces it.
+
+    Of two lines both: MuJoCo has what is wrong with a model in one, and where in the other.
+    """
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if len(lines) > 1 and lines[0].endswith(":"):
+        return f"{lines[0]} {lines[-1]}"
+    return "; ".join(lines if len(lines) == 2 else lines[:1])
+
+
 def with_type(kind: str, message: str) -> str:
     """`ValueError: message`; the type's name alone where an error says nothing."""
     return f"{kind}: {message}" if message else kind

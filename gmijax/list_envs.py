@@ -45,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
 
 def _list(argv: Sequence[str]) -> None:
     if argv:
-        raise ConfigError(f"{argv[0]}: allowed: --help")
+        raise ConfigError(f"unknown argument {argv[0]}; allowed: --help")
     with as_output():
         _print_tasks()
 

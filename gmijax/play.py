@@ -11,7 +11,7 @@ from gmijax.deploy import playing
 
 def main(argv: list[str]) -> int:
     """Returns the exit code."""
-    return command("play", PlayConfig, playing.play, argv)
+    return command("play", PlayConfig, playing.play, argv, must_print=True)
 
 
 if __name__ == "__main__":

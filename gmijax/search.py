@@ -23,7 +23,7 @@ def main(argv: list[str]) -> int:
     def run(config: TrainConfig, *, show: Show) -> None:
         searching.search(config, show=show, overrides=given)
 
-    return command("search", TrainConfig, run, argv, make=make)
+    return command("search", TrainConfig, run, argv, make=make, must_print=True)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException
 
 from gmijax.cli.groups import choices
+from gmijax.config.schema import close_name
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RUNS, RunPaths
 
@@ -115,8 +116,8 @@ def _meant(word: str) -> str:
     groups = {name: group for group in ("env", "algo") for name in choices(group)}
     if word not in (*groups, ".", "..") and os.path.isdir(RUNS / word):
         return f"; did you mean run.dir={RUNS / word}?"
-    close = difflib.get_close_matches(word, groups, n=1)
-    return f"; did you mean {groups[close[0]]}={close[0]}?" if close else ""
+    close = close_name(word, groups)
+    return f"; did you mean {groups[close]}={close}?" if close else ""
 
 
 def _unreadable(text: str, error: HydraException) -> ConfigError:
@@ -128,7 +129,15 @@ def _unreadable(text: str, error: HydraException) -> ConfigError:
         return ConfigError(f"{text}: a name is missing before or after a dot of the key")
     if function := re.search(r"while evaluating .*", str(error)):
         return ConfigError(f"{text}: {function[0]}")
-    text_of_it = f"{key}={quoted(value)}"
-    special = set(text_of_it) & set('"\\$`!')
-    shell = shlex.quote(text_of_it) if special else f'"{text_of_it}"'
+    if unclosed := re.fullmatch(r"""(['"])[^'"]+|[^'"]+(['"])""", value):
+        closed = _for_shell(f"{key}={quoted(value.strip(unclosed[1] or unclosed[2]))}")
+        return ConfigError(f"{text}: a quote is missing; text in quotes: {closed}")
+    shell = _for_shell(f"{key}={quoted(value)}")
     return ConfigError(f"{text}: not a value; text with such characters needs quotes: {shell}")
+
+
+def _for_shell(word: str) -> str:
+    """A word as people would type it; `shlex.quote` takes its single quotes to pieces."""
+    if set(word) & set("$`!"):  # A shell reads these within double quotes.
+        return shlex.quote(word)
+    return '"' + re.sub(r'("|\\(?=["\\]))', r"\\\1", word) + '"'

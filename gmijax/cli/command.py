@@ -33,6 +33,7 @@ def command(
     *,
     make: Callable[[Sequence[str]], Any] | None = None,
     shown: Callable[[Any], Mapping[str, Any]] = to_dict,
+    must_print: bool = False,
 ) -> int:
     """Runs one of the commands; returns its exit code.
 
@@ -43,6 +44,7 @@ def command(
       argv: the command line.
       make: what the overrides stand for; None: a configuration `cls`.
       shown: what `--cfg job` prints of it.
+      must_print: whether it has failed where its output cannot be written, as its answer is there.
     """
 
     def whole() -> None:
@@ -59,6 +61,8 @@ def command(
             console = open_console(show="verbose" if verbose else True)
             console.opening = _task_nobody_chose(made, overrides)
             run(made, show=console)
+            if must_print:
+                console.require_printed()
 
     return exit_code_of(name, whole)
 
@@ -98,7 +102,7 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
         at = arguments.index("--cfg")
         if arguments[at + 1 : at + 2] != ["job"]:
             given = [text for text in arguments[at : at + 2] if "=" not in text]
-            raise ConfigError(f"{' '.join(given)}: allowed: job")
+            raise ConfigError(f"{' '.join(given)}: expected --cfg job")
         del arguments[at : at + 2]
         show = True
     for text, after in zip_longest(arguments, arguments[1:], fillvalue="-"):

@@ -26,7 +26,7 @@ from gmijax.cli.saved import NAMED_BY_TASK, as_the_run_was, copy_key, with_saved
 from gmijax.config import EnvConfig, ServeConfig, TrainConfig
 from gmijax.config.env import choice_of
 from gmijax.config.removed import require_not_removed
-from gmijax.config.schema import flatten, from_dict, known, require_between, suggestion
+from gmijax.config.schema import convert, flatten, from_dict, known, require_between, suggestion
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.resume import any_checkpoint
@@ -39,7 +39,7 @@ from gmijax.runs.saved_config import (
 )
 from gmijax.sim.registry import SUITES
 from gmijax.sim.robots import robot_name
-from gmijax.sim.source import reference
+from gmijax.sim.source import names_file, no_reference, reference
 
 C = TypeVar("C")
 
@@ -105,10 +105,11 @@ def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
     if _COMPOSED.get(name) is TrainConfig:
         _check_task_key(items)
         resume = data["run"].get("resume") if isinstance(data["run"], dict) else None
+        resume = convert(str | None, resume, "run.resume")
         if resume == "auto":
             data = as_the_run_was(data, items, _chosen_only(name, overrides, items))
         elif resume is not None:
-            data = _on_top_of_saved(data, items, str(resume))
+            data = _on_top_of_saved(data, items, resume)
     for key, value in flatten(data).items():  # What the environment has may be anything.
         if isinstance(value, str):
             require_text(f"{key}={value}")
@@ -145,9 +146,9 @@ def _chosen_only(
 def _choices_of_run(name: str, items: Sequence[Override]) -> list[str]:
     """`env=` and `algo=` of the run to resume or to serve: they decide which keys there are."""
     key = {"train": "run.resume", "serve": "run.dir"}.get(name, "")
-    given = {item.key_or_group: str(item.value()) for item in items}
-    run = given.get(key, "null")
-    if run in ("null", "None", "", "auto"):
+    given = {item.key_or_group: item.value() for item in items}
+    run = convert(str | None, given.get(key), key)
+    if not run or run == "auto":
         return []
     saved = saved_config_of(run, key)
     suite, task = saved["env"].get("suite", "gmijax"), saved["env"].get("name")
@@ -231,6 +232,8 @@ def _check_override(name: str, item: Override) -> None:
         suite, colon, of_suite = str(item.value()).partition(":")
         if key == "env" and colon and suite in options:  # As labels and run folders have it.
             hint = f": did you mean env={suite} env.name={of_suite}?"
+        elif key == "env" and names_file(str(item.value())):
+            raise no_reference(str(item.value()))
         raise ConfigError(
             f"{key}={item.value()}: unknown{kind}{hint or suggestion(str(item.value()), options)}"
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import json
 import re
 import sys
 import types
@@ -190,8 +191,16 @@ def flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def suggestion(key: str, allowed: typing.Iterable[str]) -> str:
     """`: did you mean ...` where a name is close, else `; allowed: ...`."""
     names = sorted(allowed)
-    close = difflib.get_close_matches(key, names, n=1)
-    return f": did you mean {close[0]}?" if close else f"; allowed: {', '.join(names) or 'none'}"
+    if close := close_name(key, names):
+        return f": did you mean {close}?"
+    return f"; allowed: {', '.join(names) or 'none'}"
+
+
+def close_name(word: str, names: typing.Iterable[str]) -> str | None:
+    """The one of the names that a word may mean, in capitals or not."""
+    of_small = {name.lower(): name for name in names}
+    close = difflib.get_close_matches(word.lower(), of_small, n=1)
+    return of_small[close[0]] if close else None
 
 
 def _has_default(cls: Any, key: str) -> bool:
@@ -204,7 +213,7 @@ def convert(kind: Any, value: Any, key: str) -> Any:
     trees: list[Any] = [x for x in _options(kind) if dataclasses.is_dataclass(x)]
     if trees:
         if not isinstance(value, Mapping):
-            raise ConfigError(f"{key}={value!r}: expected a group of keys")
+            raise ConfigError(f"{key}={_shown(value)}: expected a group of keys")
         if len(trees) > 1:
             return from_named(trees, value, f"{key}.")
         return from_dict(trees[0], value, f"{key}.")
@@ -309,4 +318,7 @@ def _describe(kind: Any) -> str:
 
 
 def _shown(value: Any) -> str:
+    """As plain data has it: `null` and `true`, which Python calls otherwise."""
+    if value is None or isinstance(value, bool):
+        return json.dumps(value)
     return str(value) if isinstance(value, str) else repr(value)

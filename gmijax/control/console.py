@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, TextIO, TypeAlias
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from gmijax.control.output import discard
+from gmijax.control.output import discard, not_written, why_of
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.names import nearby
@@ -34,6 +34,7 @@ class _BestEffortStream:
 
     def __init__(self, stream: TextIO | None) -> None:
         self._stream = stream
+        self.error: str | None = "it is closed" if stream is None else None
         self.encoding = getattr(stream, "encoding", None) or "utf-8"
 
     def write(self, text: str) -> int:
@@ -56,9 +57,11 @@ class _BestEffortStream:
             return
         try:
             act(stream)
-        except (OSError, ValueError):
+        except (OSError, ValueError) as error:
             self._stream = None
             discard(stream)
+            if not isinstance(error, BrokenPipeError):  # Such a reader has read enough.
+                self.error = why_of(error)
 
 
 class UserConsole(Console):
@@ -78,6 +81,11 @@ class UserConsole(Console):
         if opening is not None:
             super().print(opening)
         super().print(*objects, **named)
+
+    def require_printed(self) -> None:
+        """Raises GmijaxError if something could not be printed."""
+        if isinstance(self.file, _BestEffortStream) and self.file.error:
+            raise not_written(self.file.error)
 
 
 Show: TypeAlias = bool | Literal["verbose"] | UserConsole

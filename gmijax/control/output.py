@@ -31,8 +31,17 @@ def write_output(text: str) -> None:
         discard(stream)
     except (OSError, ValueError) as error:
         discard(stream)
-        why = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        raise GmijaxError(f"the output cannot be written ({why})") from None
+        raise not_written(why_of(error)) from None
+
+
+def not_written(why: str) -> GmijaxError:
+    """What a command that could not print its answer raises."""
+    return GmijaxError(f"the output cannot be written ({why})")
+
+
+def why_of(error: OSError | ValueError) -> str:
+    """What went wrong with a stream, in a few words."""
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 class _Collected(io.StringIO):

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from gmijax.deploy.sealed import unsealed
 from gmijax.errors import ConfigError, lines_of
-from gmijax.runs.folder import read_json
+from gmijax.runs.folder import ExportPaths, read_json
 from gmijax.runs.resume import choose_checkpoint
 
 _Actions = npt.NDArray[np.float32]
@@ -84,6 +84,7 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     kinds = {".onnx": _from_onnx, ".stablehlo": _from_stablehlo}
     kind = kinds.get(os.path.splitext(text)[1])
     if kind is None:
+        _require_no_file(text)
         checkpoint, passed_over = choose_checkpoint(text, "path")
         for line in passed_over:
             warnings.warn(line, RuntimeWarning, stacklevel=2)
@@ -91,6 +92,19 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     if not os.path.isfile(text):  # Unlike `Path.is_file` it takes any text.
         raise ConfigError(f"path={text}: no such file")
     return kind(Path(text))
+
+
+def _require_no_file(path: str) -> None:
+    """Names the file that the folder of an export stands for, or what may be given."""
+    exported = ExportPaths(Path(path))
+    for file in (exported.onnx, exported.stablehlo):
+        if os.path.isfile(file):
+            raise ConfigError(f"path={path}: an exported policy is a file; did you mean {file}?")
+    if os.path.isfile(path):
+        raise ConfigError(
+            f"path={path}: is not a folder of a run or a checkpoint, and no file .onnx or "
+            ".stablehlo"
+        )
 
 
 def _from_checkpoint(checkpoint: Path) -> Policy:

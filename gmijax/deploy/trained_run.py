@@ -45,7 +45,9 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
       NoCheckpointYet: the run is being trained, and has none yet.
       ConfigError: no such run or checkpoint, or its task cannot be had.
     """
-    if config.run.env is not None and ".py" not in config.run.env:
+    if config.run.env is not None and source.names_file(config.run.env):
+        source.split(config.run.env)
+    elif config.run.env is not None:
         hint = f"; to play the policy that comes with gmijax, add checkpoint={SHIPPED}"
         why = "not needed, a run knows its task" + (
             "" if isinstance(config, ExportConfig) else hint

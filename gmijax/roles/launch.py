@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 import os
 import pickle
 import sys
@@ -184,14 +185,21 @@ def _check_numbers(
     stall_timeout_s: float | None,
     grace_s: float,
 ) -> None:
+    _require_number("pipe_mib", pipe_mib)
     require_between("pipe_mib", pipe_mib, MIN_CAPACITY_BYTES / 2**20, MAX_PIPE_MIB)
     limits = {"timeout_s": timeout_s, "start_timeout_s": start_timeout_s, "grace_s": grace_s}
     if stall_timeout_s is not None:
         limits["stall_timeout_s"] = stall_timeout_s
     for key, value in limits.items():
+        _require_number(key, value)
         require_positive(key, value)
         if math.isinf(value):
             raise ConfigError(f"{key}={value!r}: must be finite")
+
+
+def _require_number(key: str, value: object) -> None:
+    if not isinstance(value, numbers.Real):
+        raise ConfigError(f"{key}={value!r}: expected a number")
 
 
 def _parcel(role: Role, args: tuple[Any, ...]) -> bytes:

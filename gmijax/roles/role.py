@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from gmijax.channels.messenger import Messenger
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
@@ -167,4 +169,6 @@ class Role(ABC):
 
     def progress(self, step: int) -> None:
         """Reports how far this GMI is, as messages and collective calls do; cheap."""
-        here("progress").progress(step)
+        if not isinstance(step, int | np.integer) or not 0 <= step < 2**63:
+            raise ConfigError(f"step={step!r}: expected a whole number of at least 0")
+        here("progress").progress(int(step))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from gmijax.config.schema import close_name
 from gmijax.errors import ConfigError, NoCheckpointYet
 from gmijax.runs.checkpoints import (
     CheckpointMeta,
@@ -107,8 +107,8 @@ def _meant(wanted: str, key: str) -> str:
     if is_name:
         words = ("last", "auto") if key == "run.resume" else ("last",)
         near |= dict(zip(words, words, strict=True))
-    close = difflib.get_close_matches(folder.name, near, n=1)
-    return f"; did you mean {near[close[0]]}?" if close else ""
+    close = close_name(folder.name, near)
+    return f"; did you mean {near[close]}?" if close else ""
 
 
 def last_run(key: str) -> Path:

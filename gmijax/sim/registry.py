@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 from gmijax.config import EnvConfig
 from gmijax.config.env import ROBOTS, choice_of
+from gmijax.config.schema import suggestion
 from gmijax.errors import ConfigError
 from gmijax.machine.xla_on_cpu import missing_on_cpu
 from gmijax.sim import source
@@ -66,7 +67,9 @@ def require_task(name: str, suite: str = "gmijax") -> None:
     if suite == "custom":
         source.split(name)
     if suite == "gmijax" and name not in TASKS:
-        raise ConfigError(f"env={name}: unknown task; allowed: {', '.join(task_names())}")
+        if source.names_file(name):
+            raise source.no_reference(name)
+        raise ConfigError(f"env={name}: unknown task{suggestion(name, (*TASKS, *ROBOTS))}")
 
 
 def require_own(env: EnvConfig) -> None:

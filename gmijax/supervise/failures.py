@@ -17,6 +17,7 @@ from gmijax.errors import (
     PeerLost,
     PipeClosed,
     ReportedError,
+    gist_of,
     printable,
     with_type,
 )
@@ -139,6 +140,5 @@ def last_lines(path: Path, num_bytes: int = _TAIL_BYTES, begins: int = 0) -> lis
 
 
 def first_line(text: str, most: int | None = _MAX_LINE) -> str:
-    """The first line of a text as it may be shown, shortened to `most` characters."""
-    lines = text.strip().splitlines()
-    return printable(lines[0])[:most] if lines else ""
+    """The gist of a text as it may be shown, shortened to `most` characters."""
+    return printable(gist_of(text))[:most]

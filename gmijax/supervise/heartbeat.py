@@ -12,7 +12,7 @@ import mmap
 import os
 from typing import Any, Final, Literal, NamedTuple, get_args
 
-from gmijax.errors import ReportedError
+from gmijax.errors import ReportedError, gist_of
 
 GmiState = Literal["starting", "waiting", "compiling", "ready", "running", "done"]
 
@@ -83,9 +83,11 @@ class HeartbeatBlock:
         return Heartbeat(state, self._numbers[_ITERATION], self._numbers[_PID])
 
     def write_error(self, error: ReportedError) -> None:
-        """Says why the GMI fails; of long texts the beginning or, of a traceback, the end."""
+        """Says why the GMI fails; of a long message the gist, of a long traceback the end."""
+        is_long = len(error.message) > _MAX_MESSAGE
+        message = gist_of(error.message) if is_long else error.message
         cut = error._replace(
-            message=error.message[:_MAX_MESSAGE],
+            message=message[:_MAX_MESSAGE],
             traceback=error.traceback[-_MAX_TRACEBACK:],
             missing=error.missing[:_MAX_MISSING],
         )

@@ -340,7 +340,10 @@ def test_an_environment_of_brax_brings_its_model_and_length():
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("antt", {}, r"^env=antt: unknown task; allowed: ant, anymal, ball_balance, "),
+        ("antt", {}, r"^env=antt: unknown task: did you mean ant\?$"),
+        ("Go1", {}, r"^env=Go1: unknown task: did you mean go1\?$"),
+        ("xyzzy", {}, r"^env=xyzzy: unknown task; allowed: ant, anymal, .*g1, g1_rough, go1, "),
+        ("cart.txt:make", {}, r"^env=cart\.txt:make: expected PATH\.py:FUNCTION, e\.g\. path"),
         ("ant", {"episode_length": 0}, r"^env\.episode_length=0: must be at least 1$"),
         ("antt", {"suite": "brax"}, r"^env\.name=antt: Brax has .*did you mean ant\?$"),
         (

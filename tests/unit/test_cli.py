@@ -34,6 +34,12 @@ APART = "plan.serving_gpus, plan.training_gpus: GPUs [1] both act and train and 
 REFUSED: list[tuple[str, str, str]] = [
     # Keys and options that are not there.
     ("train", "env=antt", "env=antt: unknown task: did you mean ant?"),
+    ("train", "env=ANT", "env=ANT: unknown task: did you mean ant?"),
+    ("train", "ANT", "ANT: expected key=value; did you mean env=ant?"),
+    ("TRAIN", "", "gmijax: unknown command 'TRAIN': did you mean train?"),
+    ("play", "--help RUN", "--help RUN: no such topic: did you mean run?"),
+    ("train", "run.resume=AUTO", "run.resume=AUTO: no such folder; did you mean auto?"),
+    ("play", "run.dir=LAST", "run.dir=LAST: no such folder; did you mean last?"),
     ("train", "env=brax:ant", "unknown task: did you mean env=brax env.name=ant?"),
     ("sweep", "env=playground:Go1Getup", "did you mean env=playground env.name=Go1Getup?"),
     ("train", "algo=td3", "algo=td3: unknown algorithm: expected one of a3c, distill, ppo, sac"),
@@ -56,10 +62,13 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "--num-envs=64", "; did you mean num_envs=64?"),
     ("train", "--num_envs 64", "; did you mean num_envs=64?"),
     ("export", "--json run.dir=X", "--help, --verbose, --cfg job, key=value\n"),
-    ("train", "env=ant --cfg", "gmijax.train: --cfg: allowed: job\n"),
-    ("train", "--cfg env=ant", "gmijax.train: --cfg: allowed: job\n"),
-    ("train", "--cfg all", "gmijax.train: --cfg all: allowed: job\n"),
-    ("list-envs", "x", "gmijax.list_envs: x: allowed: --help\n"),
+    ("train", "env=ant --cfg", "gmijax.train: --cfg: expected --cfg job\n"),
+    ("train", "--cfg env=ant", "gmijax.train: --cfg: expected --cfg job\n"),
+    ("train", "--cfg all", "gmijax.train: --cfg all: expected --cfg job\n"),
+    ("list-envs", "--json x", "gmijax.list_envs: unknown argument --json; allowed: --help\n"),
+    ("demo", "env=ant --json", "gmijax.demo: unknown option --json; allowed: --help, key=value\n"),
+    ("--json", "", "gmijax: unknown option --json; allowed: --help, --version, -sc, "),
+    ("list-envs", "x", "gmijax.list_envs: unknown argument x; allowed: --help\n"),
     ("pack", "seed= -- true {seed}", "seed=: must not be empty\n"),
     ("sweep", "--seed 1 --quiet", "unknown option --seed; allowed: --help, --verbose, "),
     ("train", "seed=0,1", "(a list stands in brackets); gmijax sweep takes several"),
@@ -129,7 +138,14 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "num_envs=3 algo.unroll_length=1", "do not divide into algo.num_minibatches=4"),
     ("train", "seed=range(1,3)", "seed=range(1,3): expected one value"),
     ("train", "plan.gpus=0,1", "plan.gpus=0,1: expected one value (a list "),
-    ("train", "run=null", "run=None: expected a group of keys"),
+    ("train", "run=null", "run=null: expected a group of keys"),
+    ("play", "run.dir=true", "run.dir=true: expected text or null"),
+    ("serve", "run.dir=true", "run.dir=true: expected text or null"),
+    ("train", "run.resume=false", "run.resume=false: expected text or null"),
+    ("search", "run.resume=true", "run.resume=true: expected text or null"),
+    ("train", "run.resume=5.5", "run.resume=5.5: expected text or null"),
+    ("train", "num_envs=true", "num_envs=true: expected an integer or auto"),
+    ("play", "video=true", "video=true: expected one of auto, mp4"),
     ("train", "run.dir={1:2}", "run.dir={1: 2}: expected text or null"),
     ("train", "algo.learning_rate=inf", "algo.learning_rate=inf: expected a finite number"),
     ("train", "algo.desired_kl=nan", "algo.desired_kl=nan: expected a finite number"),
@@ -176,6 +192,11 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "env=ball_balance env.name=ant", "choose the task with env=ant"),
     ("train", "env=brax", "env.name: must be given with env=brax, e.g. env.name=ant"),
     ("train", "env=nowhere.py:make", "env=nowhere.py:make: no such file"),
+    *(
+        (command, f"env={name}", f"env={name}: expected PATH.py:FUNCTION, e.g. path/to/cart.py:m")
+        for command in ("train", "sweep", "play", "export", "view")
+        for name in ("base/config.json:make", "cart:make", "cart.pyc", "./cart")
+    ),
     ("train", "env=nowhere.py", "env=nowhere.py: expected PATH.py:FUNCTION"),
     ("train", f"env={LONG}.py:f", "a.py:f: no such file"),
     ("train", "env=ant env.randomize=maybe", "env.randomize=maybe: expected one of off, on, epi"),
@@ -259,6 +280,10 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "\r", r"'\r': expected text without control characters"),
     ("train", "run.name=lr=3e-4", "run.name=lr=3e-4: not a value; text with such characters"),
     ("train", "run.dir=runs/(v2)", """needs quotes: "run.dir='runs/(v2)'\""""),
+    ("train", "run.dir='a", """a quote is missing; text in quotes: "run.dir='a'\"\n"""),
+    ("play", 'run.dir="a', """a quote is missing; text in quotes: "run.dir='a'\"\n"""),
+    ("train", "run.name=a'", """a quote is missing; text in quotes: "run.name='a'\"\n"""),
+    ("train", "run.dir=it's", """needs quotes: "run.dir='it\\'s'\"\n"""),
     ("play", "run.dir=a[b", """needs quotes: "run.dir='a[b'\""""),
     (
         "train",
@@ -341,7 +366,13 @@ def test_the_home_folder_is_no_folder_of_that_name(text: str, monkeypatch: pytes
     assert compose("env=~/task.py:make").env.name == "/home/it's (one)/task.py:make"
 
 
-@pytest.mark.parametrize("value", ["lr=3e-4,h=64", "runs/(v2)", "ünder", "it's", "a\\'b", "[1"])
+@pytest.mark.parametrize(
+    "value",
+    [
+        *("lr=3e-4,h=64", "runs/(v2)", "ünder", "it's", "a\\'b", "[1", "$HOME's", "`(x", 'a"[b'),
+        *("a\\\\'b", "(it's!", "'a' b", "\\$(x)", '"a" b', "(\\"),
+    ],
+)
 def test_text_in_quotes_is_taken_as_the_message_says(value: str):
     with pytest.raises(ConfigError, match="needs quotes: ") as refused:
         compose(f"run.name={value}")

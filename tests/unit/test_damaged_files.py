@@ -237,7 +237,7 @@ def edited(run: RunPaths, key: str, value: object) -> None:
     [
         ("num_envs", "x", "num_envs=x: expected an integer or auto"),
         ("num_envs", -5, "num_envs=-5: must be "),
-        ("run.grace_s", None, "run.grace_s=None: expected a finite number"),
+        ("run.grace_s", None, "run.grace_s=null: expected a finite number"),
         ("algo.learning_rate", "fast", "algo.learning_rate=fast: expected a finite number"),
         ("env.episode_length", 0, "env.episode_length=0: must be at least 1"),
     ],

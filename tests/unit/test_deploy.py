@@ -108,7 +108,8 @@ def test_observations_of_another_shape_are_refused(policy: Any, shape: tuple[int
     ("name", "said"),
     [
         ("nowhere", "no such folder"),
-        ("bad.npz", "bad.npz: is not a folder$"),
+        ("bad.npz", r"bad.npz: is not a folder of a run or .*, and no file .onnx or .stablehlo$"),
+        ("exported", r"exported: an exported policy is a file; .* .*exported/policy.stablehlo\?$"),
         ("", "no checkpoint in this folder"),
         ("nowhere.onnx", "no such file"),
         ("nowhere.stablehlo", "no such file"),
@@ -117,6 +118,8 @@ def test_observations_of_another_shape_are_refused(policy: Any, shape: tuple[int
     ],
 )
 def test_a_path_without_a_policy_is_bad_input(tmp_path: Path, name: str, said: str):
+    (tmp_path / "exported").mkdir()
+    ExportPaths(tmp_path / "exported").stablehlo.touch()
     if name.startswith("bad"):
         (tmp_path / name).write_bytes(b"\x08\x07 no policy at all" * 9)
     with pytest.raises(ConfigError, match=f"^path=.*{said}") as error:

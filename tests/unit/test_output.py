@@ -62,12 +62,17 @@ def test_a_reader_that_is_gone_does_not_end_the_job(tmp_path: Path, shell: str):
     assert (tmp_path / "done").exists()
 
 
+PLAY_SHIPPED = "play env=ball_balance checkpoint=shipped"
+
+
 @pytest.mark.parametrize(
     ("line", "name", "unbuffered"),
     [
         ("play --help", "gmijax.play", "1"),
         ("play --help", "gmijax.play", ""),
         ("play --cfg job", "gmijax.play", ""),
+        (f"{PLAY_SHIPPED} num_envs=1 max_steps=5 video=none html=off", "gmijax.play", "1"),
+        (f"{PLAY_SHIPPED} num_envs=1 max_steps=5 video=none html=off", "gmijax.play", ""),
         ("list-envs", "gmijax.list_envs", "1"),
         ("list-envs", "gmijax.list_envs", ""),
         ("doctor --help", "gmijax.doctor", "1"),

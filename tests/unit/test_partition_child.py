@@ -82,7 +82,7 @@ def test_beats_and_errors_reach_whoever_has_the_memory(
         link.report_error(error)
     assert "raise ValueError" in read_json(link.paths.error)["traceback"]
     failure = describe_exit(3, 1, seen.read_error(), link.paths.stderr, iteration=7)
-    assert failure.reason == "exit code 1: ValueError: first"
+    assert failure.reason == "exit code 1: ValueError: first; second"
     assert (failure.iteration, failure.error) == (7, seen.read_error())
     link.report_error(KeyboardInterrupt())
     told = describe_exit(3, 1, seen.read_error(), link.paths.stderr)
@@ -107,6 +107,11 @@ def test_an_error_of_any_length_fits(block: tuple[int, HeartbeatBlock]):
     assert error is not None
     assert len(error.message) == 2000
     assert error.missing == tuple(range(10_000, 10_200))
+    lines = ["Traceback (most recent call last):", *["  File x"] * 1_000, "ZeroDivisionError: y"]
+    block[1].write_error(ReportedError("E", "\n".join(lines), ""))
+    error = block[1].read_error()
+    assert error is not None
+    assert error.message == f"{lines[0]} {lines[-1]}"
 
 
 _STACKS = """Fatal Python error: Aborted
@@ -142,6 +147,23 @@ def test_end_without_an_error_file_is_described(
     paths = GmiPaths(tmp_path)
     paths.stderr.write_text(stderr)
     assert describe_exit(0, exit_code, None, paths.stderr).reason == reason
+
+
+@pytest.mark.parametrize(
+    ("message", "shown"),
+    [
+        ("", "ValueError"),
+        ("\n first \n second\n third", "ValueError: first"),
+        ("what is wrong\n\nwhere\n", "ValueError: what is wrong; where"),
+        (
+            "calling back: Traceback (most recent call last):\n  File x\nZeroDivisionError: y",
+            "ValueError: calling back: Traceback (most recent call last): ZeroDivisionError: y",
+        ),
+    ],
+)
+def test_an_error_of_several_lines_is_told_in_one(tmp_path: Path, message: str, shown: str):
+    error = ReportedError("ValueError", message, "")
+    assert describe_exit(0, 1, error, tmp_path / "log").reason == f"exit code 1: {shown}"
 
 
 def test_cause_goes_before_consequence_and_an_abort_after_other_causes(tmp_path: Path):

@@ -33,6 +33,9 @@ def role_with(**attributes: object) -> Stuck:
         ([Stuck(), 3], {}, "^role=3: expected a gmijax.Role, got int$"),
         (role_with(of=threading.Lock()), {}, r"^role=Stuck: cannot be sent .*lock.* in run$"),
         (Stuck(), {"timeout_s": 0}, "^timeout_s=0: must be greater than 0$"),
+        (Stuck(), {"timeout_s": "60"}, "^timeout_s='60': expected a number$"),
+        (Stuck(), {"grace_s": None}, "^grace_s=None: expected a number$"),
+        (Stuck(), {"pipe_mib": "2"}, "^pipe_mib='2': expected a number$"),
         (Stuck(), {"stall_timeout_s": -1.0}, "^stall_timeout_s=-1.0: must be greater than 0$"),
         (Stuck(), {"grace_s": float("inf")}, "^grace_s=inf: must be finite$"),
         (Stuck(), {"pipe_mib": 0.1}, "^pipe_mib=0.1: must be between 0.25 and 16384$"),
@@ -93,6 +96,14 @@ def test_the_manager_says_what_is_missing() -> None:
     assert manager.get_group(0, "all") == {0, 1}
     with pytest.raises(ConfigError, match=r"^allreduce: only inside a GMI"):
         manager.allreduce(np.ones(1))
+
+
+@pytest.mark.parametrize("step", [-1, 1.5, "one", 2**63, None])
+def test_progress_is_a_whole_number(step: Any) -> None:
+    with pytest.raises(ConfigError, match=r"^step=.*: expected a whole number of at least 0$"):
+        Talk(1).progress(step)
+    with pytest.raises(ConfigError, match=r"^progress: only inside a GMI"):
+        Talk(1).progress(np.int64(1))
 
 
 def test_roles_talk_only_in_a_gmi() -> None:

@@ -35,6 +35,10 @@ def make(*, impl, max_envs):
     return Env(SPEC, (), reset, step, None, lambda state: state.physics)
 """
 
+READS_MODEL = """from mujoco import MjModel
+    MjModel.from_xml_string("<mujoco>{}</mujoco>")
+    return Env("""
+
 
 def written(folder: Path, text: str) -> str:
     (folder / "point.py").write_text(text)
@@ -111,6 +115,16 @@ def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pyte
             "assert False\n    return Env(",
             r"fails: AssertionError \(.*point\.py:\d+\)$",
         ),
+        (
+            "return Env(",
+            READS_MODEL.format("<optoin/>"),
+            r"unrecognized element; Element 'optoin', line 1 \(.*point\.py:\d+\)$",
+        ),
+        (
+            "return Env(",
+            READS_MODEL.format("<a>"),
+            r"ValueError: XML parse error \d+: .*MISMATCHED.* \(.*point\.py:\d+\)$",
+        ),
         ("def make(", "def make(:", r"point\.py fails: SyntaxError: .*line 8\)$"),
         (
             "import jax.",
@@ -121,6 +135,8 @@ def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pyte
         ("return Env(SPEC", "return Env(None", r"spec: expected an EnvSpec, got NoneType"),
         ("return Env(", "return (", r"expected a gmijax\.sim\.interface\.Env, got tuple$"),
         ('"point", 2', '"point", 0', r"spec\.obs_size=0: must be an integer of at least 1$"),
+        ("0.1,", "0.0,", r"spec\.control_dt_s=0\.0: must be a number of seconds greater than 0$"),
+        ("0.1,", "'fast',", r"spec\.control_dt_s='fast': must be a number of seconds greater th"),
         ('"point", 2', '"point", 3', r"obs is float32\[2\], not float32\[3\]$"),
         (
             "state, moved,",

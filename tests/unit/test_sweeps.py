@@ -103,7 +103,7 @@ def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
         (("sweep.trials=3", "seed=0,1"), "sweep.sampler=grid runs all of them"),
         (("sweep.pruner=asha", "seed=0,1"), "not with sweep.sampler=grid"),
         (("sweep.pack=mps", "seed=0,1"), "expected one of gmi, vmap, auto"),
-        (("cluster=null", "seed=0,1"), "cluster=None: expected a group of keys"),
+        (("cluster=null", "seed=0,1"), "cluster=null: expected a group of keys"),
         (("++cluster=3", "seed=0,1"), "cluster=3: expected a group of keys"),
         (("~sweep", "seed=0,1"), "missing key sweep"),
         (

@@ -5,6 +5,7 @@ Reset and step are traced, not run: that takes a second or two, and gives shapes
 
 from __future__ import annotations
 
+import numbers
 import operator
 import traceback
 from collections.abc import Callable
@@ -15,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.errors import ConfigError, with_type
+from gmijax.errors import ConfigError, gist_of, with_type
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.types import PyTree
 
@@ -68,7 +69,16 @@ def _with_plain_sizes(spec: EnvSpec, what: str) -> EnvSpec:
             f"{what}: spec.actor_obs_size={spec.actor_obs_size!r}: must be an integer from 1 to "
             f"spec.obs_size={spec.obs_size}, or None"
         )
+    _require_duration(spec.control_dt_s, what)
     return spec._replace(actor_obs_size=seen)
+
+
+def _require_duration(seconds: Any, what: str) -> None:
+    """Films, the viewer and robots divide by it; what Brax does not say is NaN."""
+    if not isinstance(seconds, numbers.Real) or seconds <= 0:
+        raise ConfigError(
+            f"{what}: spec.control_dt_s={seconds!r}: must be a number of seconds greater than 0"
+        )
 
 
 def _integer(value: Any) -> int | None:
@@ -103,9 +113,8 @@ def attempt(what: str, function: Callable[..., Any], *arguments: Any, **named: A
     except ConfigError:
         raise
     except (Exception, SystemExit) as error:
-        lines = str(error).strip().splitlines() or [""]
         found = f"; {_FOUND}" if isinstance(error, ModuleNotFoundError) else ""
-        message = with_type(type(error).__name__, lines[0])
+        message = with_type(type(error).__name__, gist_of(str(error)))
         raise ConfigError(f"{what} fails: {message}{_line_of(error)}{found}") from error
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -14,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.config.env import ROBOTS, label_of
-from gmijax.config.schema import flatten, suggestion
+from gmijax.config.schema import close_name, flatten, suggestion
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters.brax_interface import adapt
 from gmijax.sim.adapters.checks import attempt
@@ -212,6 +211,6 @@ def without_warnings(theirs: Any) -> Any:
 
 
 def _unknown(name: str, names: tuple[str, ...]) -> str:
-    close = difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean {close[0]}?" if close else "see mujoco_playground.registry.ALL_ENVS"
+    close = close_name(name, names)
+    hint = f"did you mean {close}?" if close else "see mujoco_playground.registry.ALL_ENVS"
     return f"env.name={name}: Playground has no such environment: {hint}"
