@@ -91,7 +91,7 @@ class Batcher:
         return batch
 
     def close(self) -> None:
-        """Tells the agents that nothing more is wanted. Idempotent."""
+        """Makes the agents stop: nothing more is read. Idempotent."""
         self._held.close()
 
     def _await_rollouts(self, deadline_s: float, timeout_s: float) -> Rollouts:
@@ -203,7 +203,7 @@ class Stack:
         return Rollouts(self.spec, self._so_far(), versions.copy(), agents.copy())
 
     def _begin(self) -> None:
-        """Makes room for a batch; the last one's memory may be used again."""
+        """Prepares memory for a batch; that of the last one may be used again."""
         self._arrays = self._arrays or {
             channel.name: np.empty(channel.full_shape(self.size), channel.dtype)
             for channel in self.spec.channels

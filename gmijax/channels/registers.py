@@ -132,10 +132,10 @@ def open_registers(fd: int, sizes_bytes: Sequence[int]) -> list[Register]:
     mapping = map_file(fd, offset + 2 * sum(sizes), "registers")
     lines = np.frombuffer(mapping, LINE, len(sizes))
     registers = []
-    for index, (size, room) in enumerate(zip(sizes_bytes, sizes, strict=True)):
-        buffers = np.frombuffer(mapping, np.uint8, 2 * room, offset).reshape(2, room)
+    for index, (size, padded) in enumerate(zip(sizes_bytes, sizes, strict=True)):
+        buffers = np.frombuffer(mapping, np.uint8, 2 * padded, offset).reshape(2, padded)
         registers.append(Register(lines[index : index + 1], buffers[:, :size]))
-        offset += 2 * room
+        offset += 2 * padded
     return registers
 
 

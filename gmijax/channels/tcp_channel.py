@@ -39,7 +39,7 @@ class _Received(NamedTuple):
 
 
 class _End:
-    """What both ends of a way have: a connection, and whether the peer has said goodbye."""
+    """What both ends of a channel have: a connection, and whether the peer has closed its end."""
 
     def __init__(self, connection: Connection) -> None:
         self.peer = connection.peer
