@@ -30,7 +30,7 @@ class CollectorContext(NamedTuple):
     """One GMI's part of a serving job.
 
     Attributes:
-      rank: place among the GMIs that simulate (an agent: among the agents).
+      rank: among the GMIs that simulate (an agent: among the agents).
       first_unroll: unrolls that earlier jobs have written of this GMI's part.
       num_unrolls: unrolls that are left to be made.
       writer: takes the experience, None where it is not kept.

@@ -27,7 +27,7 @@ class MigInstance(NamedTuple):
 class Gpu(NamedTuple):
     """A GPU as NVML lists it."""
 
-    index: int  # Place in the list of nvidia-smi.
+    index: int  # In the list of nvidia-smi.
     uuid: str  # `GPU-...`.
     name: str  # Product name.
     memory_mib: int  # Total memory, MiB.
@@ -145,7 +145,7 @@ def _instances(handle: Any) -> tuple[MigInstance, ...]:
     with suppress(pynvml.NVMLError):
         most = pynvml.nvmlDeviceGetMaxMigDeviceCount(handle)
     for index in range(most):
-        # Holes are normal: instances keep their places when others go.
+        # Gaps are normal: instances keep their indices when others are removed.
         with suppress(pynvml.NVMLError):
             found.append(_describe_instance(handle, index))
     return tuple(found)

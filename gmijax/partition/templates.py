@@ -45,8 +45,8 @@ class Group(NamedTuple):
     """The GMIs of a layout that have a role, as ranks of their own."""
 
     gmis: tuple[int, ...]  # Their ids in order; a GMI's rank in the group is its position here.
-    # Where they are, with ranks in place of ids; GPUs and nodes without one of them are left out.
-    # Its nodes are those only if these are alike: who reduces asks for that.
+    # Where they are, with ranks instead of ids; GPUs and nodes without one of them are left out.
+    # Its nodes are right only if all have the same layout, which a reduction requires.
     layout: Layout
 
 

@@ -59,7 +59,7 @@ class ChildLink:
         which other processes compiled are `waiting` alone.
 
     Args:
-      heartbeat_fd: inherited memory for beats and errors, None where nobody reads them.
+      heartbeat_fd: inherited memory for beats and errors, None where no process reads them.
     """
 
     def __init__(
@@ -164,16 +164,16 @@ class ChildLink:
         self._block.write(Heartbeat(state, iteration, os.getpid()))
 
     def report_error(self, error: BaseException) -> None:
-        """Says why this GMI fails, also in `error.json`; end with a non-zero code after it."""
-        said = ReportedError(
+        """Reports why this GMI fails, also in `error.json`; end with a non-zero code after it."""
+        report = ReportedError(
             type(error).__name__,
             str(error),
             "".join(traceback.format_exception(error)),
             error.missing if isinstance(error, CollectiveTimeout) else (),
         )
-        self._block.write_error(said)
+        self._block.write_error(report)
         with suppress(OSError):  # The disk may be what is wrong.
-            write_json(self.paths.error, said._asdict())
+            write_json(self.paths.error, report._asdict())
 
     def _hold_lifeline(self, lifeline_fd: int) -> None:
         while True:

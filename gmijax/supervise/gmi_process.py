@@ -133,7 +133,7 @@ class GmiProcess(WatchedGmi):
             return True
 
     def _refresh(self) -> None:
-        self._heard(self._block.beats, self._block.read())
+        self._record_heartbeat(self._block.beats, self._block.read())
 
 
 def _spawn(

@@ -69,7 +69,7 @@ class HeartbeatBlock:
         return self._numbers[_BEATS]
 
     def write(self, beat: Heartbeat) -> None:
-        """Takes the place of the beat before."""
+        """Replaces the beat before."""
         self._numbers[_STATE] = STATES.index(beat.state)
         self._numbers[_ITERATION] = beat.iteration
         self._numbers[_PID] = beat.pid
@@ -94,7 +94,7 @@ class HeartbeatBlock:
         self._numbers[_ERROR_BYTES] = len(text)
 
     def read_error(self) -> ReportedError | None:
-        """Why the GMI failed, None if it has not said so."""
+        """Why the GMI failed, None if it has reported no error."""
         size = self._numbers[_ERROR_BYTES]
         if not size:
             return None

@@ -37,7 +37,7 @@ def run_gmis(
     Args:
       launch: what to run.
       on_tick: see above.
-      signals: those that the caller hears already; None: heard while this runs.
+      signals: those that the caller handles already; None: this handles them while it runs.
 
     Raises:
       GmiFailed: a GMI failed; names the first one.

@@ -145,7 +145,7 @@ class Supervisor:
             what = f"made no progress after iteration {iteration}; GMI {cause.gmi} {cause.reason}"
             raise GmiFailed(stuck.gmi, what, iteration=iteration)
         if cause.error is not None and ended_with(cause, ConfigError):
-            # Bad input stays bad input; the end of its line has the place.
+            # Bad input stays bad input; its line ends with the location.
             raise ConfigError(first_line(cause.error.message, None))
         raise cause
 
