@@ -74,7 +74,7 @@ def measured_of(lines: Sequence[Line], num_agents: int, memory_mib: float) -> Me
     """Rates of one serving GMI, and of a serving and a training GPU, from a profile.
 
     Trainers could learn from TTOP x (update + wait for a batch) / update, agents could make PPS /
-    (1 - the part of their time for which they had to wait for room). `lines` are those that
+    (1 - the part of their time for which they had to wait for space). `lines` are those that
     `window_start` names, and the one before them.
     """
     before, *seen = lines

@@ -51,7 +51,7 @@ class A3cWorkload(Workload[TrainConfig]):
         self._counts = Split(len(serving), len(training))
         self._is_apart = _is_apart(serving, training, indices)
         is_auto = config.plan.gmis_per_gpu == AUTO
-        # In one place, and without what a profile does not depend on.
+        # As one object, and without what a profile does not depend on.
         self.plan = dataclasses.replace(
             given,
             gpus=indices or len({*serving, *training}),

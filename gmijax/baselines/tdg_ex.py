@@ -102,7 +102,7 @@ class RemoteIteration:
         self._step.wait()
 
     def close(self) -> None:
-        """Tells those that serve to end."""
+        """Makes the serving GMIs end."""
         for gmi in self._workers.gmis:
             self._workers.mail.send(None, gmi)
 

@@ -74,7 +74,7 @@ def compose(*overrides: str, command: str = "train", env: Callable[..., Any] | N
       command: `train`, `search` (a training job whose `num_envs` and `plan.gmis_per_gpu` are
         `auto`) or `serve`.
       env: a function `make(*, impl, max_envs) -> gmijax.sim.interface.Env` at the top level of a
-        file, in place of `env=path/to/file.py:make`.
+        file, instead of `env=path/to/file.py:make`.
 
     Examples:
       >>> compose("env=ant", "num_envs=512").num_envs

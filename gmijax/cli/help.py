@@ -20,7 +20,7 @@ MANY: Final = 60
 """A command with more keys shows the usual ones unless a topic is named."""
 
 _DEFAULT_WIDTH: Final = 16
-"""Of a column that must leave room for meanings in 80 columns."""
+"""Of a column that must leave space for meanings in 80 columns."""
 
 USUAL: Final = (
     *("num_envs", "num_timesteps", "seed", "unroll_length", "policy"),

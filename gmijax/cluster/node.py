@@ -112,7 +112,7 @@ class Node:
     def __init__(
         self, variables: Mapping[str, str], folder: str, interface: str | None, address: str
     ) -> None:
-        # Ray sets one thread for who has said nothing; GMIs get what fits their cores.
+        # Ray sets one thread unless the user has set a number; GMIs get what fits their cores.
         os.environ.pop("OMP_NUM_THREADS", None)
         os.environ.update(variables)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])

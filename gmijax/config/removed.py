@@ -24,7 +24,7 @@ class Removed(NamedTuple):
 REMOVED: Final[Mapping[str, Removed]] = MappingProxyType(
     {
         "reduce.selection": Removed(
-            "in place of paper write reduce.strategy=paper; device is the default, and measured "
+            "instead of paper write reduce.strategy=paper; device is the default, and measured "
             "never took another strategy than it does",
             ("device",),
         ),

@@ -112,8 +112,8 @@ def ask_jax(machine: Machine) -> JaxView:
     if done.returncode:
         lines = done.stderr.strip().splitlines()
         return JaxView(None, error=lines[-1] if lines else f"exit code {done.returncode}")
-    said = json.loads(done.stdout.strip().splitlines()[-1])
-    return JaxView(said["platform"], tuple(said["devices"]))
+    probe = json.loads(done.stdout.strip().splitlines()[-1])
+    return JaxView(probe["platform"], tuple(probe["devices"]))
 
 
 def try_mps(machine: Machine) -> str | None:

@@ -134,7 +134,7 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
 
 
 def walking_lines(config: PlayConfig, walk: Mapping[str, Any] | None) -> str:
-    """What is said of a walking test: its results, or why there was none."""
+    """The lines of a walking test: its results, or why there was none."""
     if walk is not None:
         return "\n".join(lines_of(walk))
     if config.walking_envs == 0:

@@ -66,8 +66,8 @@ class Policy:
 def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Loads a trained policy.
 
-    A file is a program that is run: load only those of people whom you trust. A RuntimeWarning
-    names every damaged checkpoint that was passed over for an older one.
+    Loading a file runs code in it: load files only from sources that you trust. A RuntimeWarning
+    names every damaged checkpoint that was skipped for an older one.
 
     Args:
       path: a run folder (its newest checkpoint), a checkpoint folder, `last`, or a file that

@@ -106,7 +106,7 @@ def save_replay(paths: RunPaths, env_steps: int, gmi: int, replay: PyTree) -> No
 
 
 def require_disk_for(run: RunPaths, replay: PyTree | None, num_gmis: int) -> None:
-    """Raises `ConfigError` if the disk of a run has no room for the replays of so many GMIs.
+    """Raises `ConfigError` if the disk of a run has no space for the replays of so many GMIs.
 
     `replay` may be shapes and dtypes; None: there is none to be saved.
     """

@@ -88,9 +88,9 @@ class CheckpointSaver:
         self._thread.report(write)
 
     def name(self) -> None:
-        """Gives the checkpoints their names soon: all GMIs have said that theirs are written.
+        """Gives the checkpoints their names soon: all GMIs have reported theirs as written.
 
-        All at once, so that runs that share a program go on from the same step after a fault.
+        All at once, so that runs that share a program continue from the same step after a fault.
         """
         parts, self._unnamed = self._unnamed, ()
         self.last_steps = parts[0].meta.env_steps

@@ -28,10 +28,10 @@ def check_diverged(where: str, diverged: Mapping[str, float], steps: float) -> N
       NonFiniteError: more than `TOLERATED_FRACTION` of them and more than `TOLERATED_STEPS`.
     """
     if diverged["any"] > max(TOLERATED_STEPS, TOLERATED_FRACTION * steps):
-        places = [name for name, count in diverged.items() if count and name != "any"]
+        arrays = [name for name, count in diverged.items() if count and name != "any"]
         raise NonFiniteError(
             f"{where}: {diverged['any']:.0f} of {steps:.0f} steps gave numbers that are not "
-            f"finite or beyond all bounds, in {', '.join(places)}"
+            f"finite or beyond all bounds, in {', '.join(arrays)}"
         )
 
 

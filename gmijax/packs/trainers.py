@@ -37,7 +37,7 @@ class Family(NamedTuple):
       patterns: regular expressions with groups `steps`, `total`, `rate` and `metric`.
       is_average: whether the printed rate is that since the start, not that of the moment.
       is_weak: whether programs that are no trainers print so too; another family that fits
-        later takes its place.
+        later replaces it.
     """
 
     name: str

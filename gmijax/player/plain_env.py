@@ -69,7 +69,7 @@ class PlainEnv:
         self._env = _plain_task(config)
         self.physics: CPhysics = self._env.model
         self._task, self._settings = str(config.name), config.settings
-        self._rng: Any = np.random.default_rng(seed)  # In the place of a key.
+        self._rng: Any = np.random.default_rng(seed)  # Instead of a key.
         self.state: EnvState
         self._diverged = False
         self.reset()

@@ -38,9 +38,9 @@ def compilation_cache_dir() -> Path:
 def drop_broken_programs(cache: Path, logs: Iterable[Path]) -> None:
     """Removes entries of programs that GMIs could not read, so that the next job writes them.
 
-    JAX writes an entry in place and never over one that is there: a process that is killed
-    meanwhile, or a full disk, leaves half an entry for every later job. `logs` are what GMIs wrote
-    to stderr. Goes with them: good entries of these programs.
+    JAX writes an entry under its final name, and never over one that is there: a process that is
+    killed meanwhile, or a full disk, leaves half an entry for every later job. `logs` are what
+    GMIs wrote to stderr. Good entries of these programs are removed too.
     """
     names: set[str] = set()
     for log in logs:

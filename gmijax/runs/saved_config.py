@@ -17,7 +17,7 @@ from gmijax.runs.names import nearby
 from gmijax.runs.resume import any_checkpoint
 
 _OWN_KEYS: Final = ("run.dir", "run.name", "run.resume", "run.profile", "env.source_sha256")
-"""Keys that every job has for itself, or of which something else is said."""
+"""Keys that every job has for itself, or for which another message exists."""
 
 
 def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
@@ -161,7 +161,7 @@ def differences(saved: Mapping[str, Any], config: TrainConfig, run: RunPaths) ->
         key: f"{key} is {now.get(key)!r}, was {before.get(key)!r}"
         for key in dict.fromkeys((*now, *before))
         if now.get(key) != before.get(key)
-        # What was decided in its place is no other wish.
+        # The value that was decided for `auto` is no different setting.
         and key not in _OWN_KEYS
         and now.get(key) != "auto"
     }

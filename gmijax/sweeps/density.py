@@ -29,7 +29,7 @@ class JobProgress(NamedTuple):
 
     Attributes:
       done: steps, or the part of the whole that is done: what is summed over jobs.
-      reports: how often it has said so since it was started.
+      reports: how often it has reported so since it was started.
     """
 
     done: float

@@ -10,7 +10,7 @@ DIGITS = 3
 """Of the number of a job in the names of its files; more jobs have more digits."""
 
 ENV_PACK_DIR = "GMIJAX_PACK_DIR"
-"""Tells a job of a pack the pack's folder."""
+"""The folder of a pack, for its jobs."""
 
 
 class SweepPaths(RunPaths):
@@ -28,7 +28,7 @@ class SweepPaths(RunPaths):
         self.sweep = root / f"{name}.json"  # Jobs, their states and results.
         self.table = root / f"{name}.csv"  # One line a job.
         self.settings = root / "settings.csv"  # One line for all seeds of a setting.
-        self.room = root / ".room"  # Of no use but its size: room for how the sweep ends.
+        self.reserve = root / ".room"  # Only its size counts: disk space for the last report.
         self.curves = root / f"{name}.png"
 
     def job(self, number: int) -> RunPaths:

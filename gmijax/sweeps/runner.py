@@ -68,7 +68,7 @@ def run_work(work: Work[J], *, show: Show = False, events: TextIO | None = None)
     started_s = time.monotonic()
     console = open_console(show=show)
     with _hosts_of(work) as hosts:
-        # Before anything is started: whether there are such GPUs, and room for so many jobs.
+        # Before anything is started: whether there are such GPUs, and slots for so many jobs.
         work.require_runnable(work.sites(hosts))
         if work.settings.sampler != "grid":
             optuna_package()

@@ -28,7 +28,7 @@ _MOST_RANDOM = 10
 
 
 class Study(Generic[J]):
-    """Hands out jobs, and is told what became of them; this one has none but those of the list."""
+    """Proposes jobs and gets their results (ask and tell); this one has none beside the list."""
 
     def next(self) -> J | None:
         """Another job; None: there is none, now or any more."""

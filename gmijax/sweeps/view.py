@@ -34,7 +34,7 @@ class SweepView:
       console: nothing is shown on a quiet one.
       jobs: those that are known; more may be added to the list.
       ranking: what they are compared by.
-      stopping: what is said of running jobs once a signal has come, whose name stands for `{}`.
+      stopping: the line about running jobs after a signal, whose name replaces `{}`.
     """
 
     def __init__(

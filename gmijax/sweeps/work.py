@@ -104,7 +104,7 @@ class Work(ABC, Generic[J]):
         """Slots for the jobs.
 
         Raises:
-          ConfigError: there are no such GPUs, or no room for so many jobs.
+          ConfigError: there are no such GPUs, or the machine cannot run so many jobs.
         """
 
     @abstractmethod
@@ -154,7 +154,7 @@ class Work(ABC, Generic[J]):
         """What must be the same where a command goes on."""
 
     def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
-        """What is to be said before the first job."""
+        """What is printed before the first job."""
         return ()
 
     def hint(self, report: Mapping[str, Any]) -> str:

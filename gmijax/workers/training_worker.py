@@ -183,14 +183,14 @@ def _run_asynchronous(
     num_averaged = exchange_size(env.spec, config.algo, A3cLosses)
     comm = _trainers_communicator(config, plan, trainers, link, num_averaged, nodes, listener)
     if listener is not None:
-        listener.close()  # Trainers that are all on one node do not meet others.
+        listener.close()  # Trainers that are all on one node connect to no others.
     held.callback(comm.close)
     trainer = Trainer(config, env, agents.gmis, registers, receiver, comm, link)
     return trainer.run() | exchange_used(plan, comm)
 
 
 def _topology(plan: Plan, trainers: Group, nodes: NodeAddresses | None) -> ChannelTopology:
-    """Who sends experience to whom, and to which address on another node."""
+    """Which agent sends experience to which trainer, and to which address on another node."""
     topology = topology_of(plan)
     if nodes is None:
         return topology
@@ -220,7 +220,7 @@ def _trainers_communicator(
     nodes: NodeAddresses | None,
     listener: socket | None,
 ) -> Communicator:
-    """The communicator among the trainers, whose ranks are their places in the group.
+    """The communicator among the trainers, whose ranks are their positions in the group.
 
     It averages `num_averaged` float32 in every update: a gradient and the parts of the loss.
     """

@@ -96,7 +96,7 @@ def attempt(what: str, function: Callable[..., Any], *arguments: Any, **named: A
     """Calls somebody else's code.
 
     Raises:
-      ConfigError: it raised anything; the line has the innermost place, the cause the rest.
+      ConfigError: it raised anything; the line has the innermost location, the cause the rest.
     """
     try:
         return function(*arguments, **named)

@@ -14,8 +14,7 @@ import mujoco
 from mujoco.mjx import warp as mjx_warp
 
 _ANY_SIZE = (64, 64)
-"""Threads of a block and number of blocks, in place of Warp's answer, which needs a compiled
-kernel."""
+"""Threads of a block and number of blocks, instead of Warp's own, which need a compiled kernel."""
 
 _ONE_AT_A_TIME = threading.Lock()
 """Held while functions of Warp are replaced."""
@@ -110,7 +109,7 @@ def _noting(found: dict[Variant, None]) -> Iterator[None]:
 
 @contextmanager
 def _replaced(owner: Any, **others: Callable[..., Any]) -> Iterator[None]:
-    """Other functions in place of those of `owner`, in this thread."""
+    """Replaces functions of `owner`, in this thread."""
     own = {name: getattr(owner, name) for name in others}
     thread = threading.get_ident()
 
