@@ -1,4 +1,4 @@
-"""What trainers and agents publish for each other, in registers that nobody ever waits for.
+"""What trainers and agents publish for each other, in registers that never block.
 
 Register 0: orders of the leading trainer. Register 1: the newest weights, with the policy's
 version as tag. Then one per agent: what it has done so far. Experience travels elsewhere. On

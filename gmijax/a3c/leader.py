@@ -90,7 +90,7 @@ class Leader:
     def checkpoint_now_and_then(self, state: TrainState) -> None:
         """Begins a checkpoint when one is due, finishes one when all agents have done theirs.
 
-        Nobody waits: the agents add their environments when they look. Until then no other
+        Nothing waits: the agents add their environments when they look. Until then no other
         checkpoint is begun.
         """
         every = self.config.run.checkpoint_every

@@ -1,4 +1,4 @@
-"""When a profile of an asynchronous job can be read, and what it says."""
+"""When a profile of an asynchronous job can be read, and its result."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FEWEST_LINES: Final = 3
 """Lines of metrics that a profile goes by, each of half a second or of one batch."""
 
 MOST_IDLE: Final = 0.95
-"""Agents that wait longer than this part of their time say little of what they could do."""
+"""Agents that wait longer than this part of their time do not show how fast they could be."""
 
 Line = Mapping[str, Any]
 

@@ -46,7 +46,7 @@ class SearchDisplay:
         return self
 
     def begin(self) -> None:
-        """Says once what takes the time, before the first profile that is not in the store."""
+        """Prints once what takes the time, before the first profile that is not in the store."""
         if not self._has_begun:
             self._has_begun = True
             self._console.print(
@@ -204,7 +204,7 @@ def _highest(outcome: SearchOutcome, wanted: Any) -> SearchPoint | None:
 
 
 def _answer(top: SearchPoint, split: Split | None) -> str:
-    """Who is where, in words."""
+    """Which GMIs are where, in words."""
     point = top.point
     envs = f"{point.num_envs} environments each"
     if not point.trainers:

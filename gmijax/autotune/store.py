@@ -1,7 +1,7 @@
 """The profile store: what profiles of searches and sweeps found, for the next.
 
 One JSON file for a device, a task with its settings, and the versions of what computes. It is
-written after every profile: what was interrupted goes on from there, and a second search of the
+written after every profile: what was interrupted continues from there, and a second search of the
 same job measures nothing.
 """
 

@@ -218,7 +218,7 @@ class Search:
             )
         except ProfileLate as late:
             if limit_s < self._settings.profile_limit_s:
-                # Cut off, which says nothing about the point.
+                # Cut off, which is no result of the point.
                 raise OutOfBudget from None
             return NotRunnable(str(late), limit_s)
         except JobInterrupted as error:

@@ -59,8 +59,8 @@ class Batcher:
         once read of it.
 
         After any error nothing is lost: what had arrived is in the next batch. An agent that is
-        gone is named at most five times a second, also while others still send; who can do
-        without it goes on.
+        gone is named at most five times a second, also while others still send; a caller may
+        catch the error and continue without it.
 
         Raises:
           CollectiveTimeout: too few came in time.
@@ -210,7 +210,7 @@ class Stack:
         }
 
     def _put(self, name: str, low: int, high: int, array: Array) -> None:
-        """Takes in rollouts `low` to `high` of a channel."""
+        """Adds rollouts `low` to `high` of a channel."""
         self._arrays[name][:, low:high] = array
 
     def _so_far(self) -> dict[str, Array]:
@@ -219,7 +219,7 @@ class Stack:
 
 
 def _read_only(array: Array) -> Array:
-    """A view that nobody can write into; of an array on a device nobody can anyway."""
+    """A read-only view; an array on a device is read-only anyway."""
     if not isinstance(array, np.ndarray):
         return array
     view = array.view()

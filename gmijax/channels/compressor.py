@@ -35,7 +35,7 @@ WORTH_IT = 0.95
 class TransferSize:
     """Doubles `num_bytes` as long as a byte gets cheaper, then keeps the best.
 
-    The price of a transfer is fixed plus so much a byte, so that there is no use in going on
+    The price of a transfer is fixed plus so much a byte, so that there is no use in continuing
     once it has stopped falling; larger transfers only make experience older.
     """
 

@@ -1,7 +1,7 @@
 """Arrays that stay on the GPU which sender and receiver share.
 
 A rank makes a block of GPU memory with a part for each peer. Arrays are copied there on the
-device, and a message says where they lie. What they take is free again when the receiver has
+device, and a message holds their location. What they take is free again when the receiver has
 released the message. So order, back-pressure and the discovery of the dead are the pipe's, and
 nothing but notes passes through the host. What lies in the block has no checksum.
 
@@ -58,7 +58,7 @@ def region_bytes(sizes: Iterable[int]) -> int:
 class SentArrays:
     """This rank's block of GPU memory, with `part_bytes` for the arrays on their way to each peer.
 
-    `released` says, in every method, how many of this rank's messages the peer has released.
+    `released` is, in every method, how many of this rank's messages the peer has released.
     """
 
     def __init__(self, peers: Collection[int], new_memory: NewMemory, part_bytes: int) -> None:

@@ -81,7 +81,7 @@ class Messenger:
         """
         self._check(src, "src")
         inbox = self._inbox(src)
-        # Nobody else sends to oneself.
+        # No other rank sends to this one's own queue.
         allowed_s = self._timeout_s if timeout_s is None else timeout_s
         allowed_s = 0.0 if src == self.rank else allowed_s
         arrived = wait_until(

@@ -44,7 +44,7 @@ class Header(NamedTuple):
 
 
 class Damaged(Exception):
-    """What stands in the ring is no message; the text says what is wrong."""
+    """The content of the ring is no message; the text is what is wrong."""
 
 
 def message_bytes(sizes: Sequence[int]) -> int:

@@ -207,7 +207,7 @@ class Connection:
 
 
 def _listening(address: tuple[str, int]) -> socket.socket:
-    """A listening socket, which may share its port with who reserved it."""
+    """A listening socket, which may share its port with the process that reserved it."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)

@@ -166,7 +166,7 @@ class RayCluster:
         options: dict[str, Any] = {"include_dashboard": False} if address == "local" else {}
         before = signal.getsignal(signal.SIGTERM)
         try:
-            # What Ray has to say of an error is in what it raises.
+            # Ray's report of an error is in what it raises.
             options |= {"log_to_driver": False, "logging_level": "CRITICAL"}
             self._ray.init(address=address, **options)
         except Exception as error:
@@ -282,7 +282,7 @@ class _NodeActor:
 
 @contextmanager
 def _for_this_job_alone() -> Iterator[None]:
-    """Variables by which Ray starts a cluster that nobody but its own processes gets into.
+    """Variables by which Ray starts a cluster that only its own processes can join.
 
     It takes no connection but of this machine, and asks for a token that is in no file. Ray reads
     them when it is imported.

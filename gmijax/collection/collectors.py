@@ -55,7 +55,7 @@ class CollectorContext(NamedTuple):
         """Environments at their starts.
 
         Starts depend on the seed, on the number of the environment in the whole job, and on how
-        many unrolls were there before: a job that goes on makes other episodes, not the same.
+        many unrolls were there before: a continued job makes other episodes, not the same.
         """
         key = jax.random.fold_in(jax.random.key(self.config.seed), self.first_unroll)
         num_envs = self.config.envs_per_gmi

@@ -14,7 +14,7 @@ class Removed(NamedTuple):
 
     Attributes:
       write: what to write now.
-      harmless: saved values with which a run goes on as it did; None: all of them.
+      harmless: saved values with which a run continues as before; None: all of them.
     """
 
     write: str

@@ -119,7 +119,7 @@ def ask_jax(machine: Machine) -> JaxView:
 def try_mps(machine: Machine) -> str | None:
     """Starts an MPS daemon as a job would and ends it again; the error, None if there is none.
 
-    Not tried where MPS is not installed, somebody's daemon runs, or no GPU can take one.
+    Not tried where MPS is not installed, a daemon runs already, or no GPU can take one.
     """
     whole = [gpu for gpu in machine.gpus if device_of(gpu) and not gpu.mig_enabled]
     if machine.mps_control is None or machine.operator_daemon is not None or not whole:

@@ -30,7 +30,7 @@ class Policy:
     Attributes:
       obs_size: O, length of an observation.
       action_size: A, length of an action.
-      metadata: what the policy is, as `policy.json` of an export says it.
+      metadata: what the policy is, as in `policy.json` of an export.
     """
 
     def __init__(

@@ -38,7 +38,7 @@ T = TypeVar("T")
 LEARNER = "learner"
 
 EPISODES = "episodes.json"
-"""The latest episodes before a checkpoint, over which metrics go on after it."""
+"""The latest episodes before a checkpoint, which metrics after it include."""
 
 
 def checkpoint_meta(

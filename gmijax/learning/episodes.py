@@ -94,7 +94,7 @@ class EpisodeRunner:
         Args:
           state: weights and the observations' statistics.
           go_on: called after every chunk with the number of chunks done, and whether any episode
-            still runs; says whether to run another chunk.
+            still runs; returns whether to run another chunk.
         """
         started = time.monotonic()
         batch, shown = self._begin(self._model, self._keys)

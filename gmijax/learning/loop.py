@@ -223,7 +223,7 @@ class TrainingLoop:
             self._env_steps += self._steps_per_iteration
             evaluation = self._evaluate(state)
             thread.report(self._env_steps, metrics, self._times(), evaluation)
-            # Counted from the run's start, so that it says the same after a restart.
+            # Counted from the run's start, so that it is the same after a restart.
             self._link.beat("running", self._env_steps // self._steps_per_iteration)
             stop = self._agree_to_stop()
             is_last = stop or self._env_steps >= num_timesteps
@@ -277,9 +277,9 @@ class TrainingLoop:
         thread: ReportThread,
         evaluation: Evaluation | None,
     ) -> None:
-        """Begins to write a checkpoint of every run; training goes on meanwhile."""
+        """Begins to write a checkpoint of every run; training continues meanwhile."""
         self._iteration.wait()
-        thread.wait()  # A resumed run goes on from the lines up to its checkpoint.
+        thread.wait()  # A resumed run continues after the lines up to its checkpoint.
         self._saver.finish()  # Two copies on the host at once may be too much.
         learned = self._algorithm.learned(state)
         require_equal(self._comm, self._link.gmi, learned, self._env_steps)

@@ -57,7 +57,7 @@ class OverflowCount:
         self.steps: dict[str, float] = {}
 
     def add(self, overflowed: Mapping[str, float]) -> None:
-        """Takes in steps by buffer, of one iteration or unroll."""
+        """Adds steps by buffer, of one iteration or unroll."""
         for name, count in overflowed.items():
             before = self.steps.get(name, 0.0)
             if count and not before:

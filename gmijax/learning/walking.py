@@ -1,7 +1,7 @@
 """Records the walking test in MJX: any policy in one of Playground's joystick tasks.
 
-Each environment has one start, which no training has, and is never reset. What the recording
-says of the policy is computed by `gmijax.player.walking`.
+Each environment has one start, which no training has, and is never reset. The results for the
+policy are computed from the recording by `gmijax.player.walking`.
 """
 
 from __future__ import annotations

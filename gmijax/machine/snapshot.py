@@ -29,7 +29,7 @@ from gmijax.machine.nvidia import Gpu, driver_version, gpu_problem, list_gpus
 from gmijax.runs.cache import why_temporary
 
 _HIDES_ALL = ("", "-1", "NoDevFiles")
-"""Values of `CUDA_VISIBLE_DEVICES` that say on purpose that there are no GPUs."""
+"""Values of `CUDA_VISIBLE_DEVICES` that hide all GPUs on purpose."""
 
 DAEMONS_VARIABLE = "GMIJAX_MPS_DAEMONS"
 """The MPS daemons that a sweep or pack runs for its jobs: JSON, see `Machine.daemons`."""
@@ -47,7 +47,7 @@ class Machine:
         more than its control group gets time for.
       mps_control: program of the MPS daemon, None where it is not installed.
       driver_version: of the NVIDIA driver, None without one.
-      operator_daemon: pipe directory of a running MPS daemon that somebody else started.
+      operator_daemon: pipe directory of a running MPS daemon that gmijax did not start.
       daemons: the same for a job of a sweep or pack, by UUID of the GPU or MIG instance.
       host: what is left of memory, threads and open files.
       gpu_problem: why there are no GPUs although NVIDIA's driver is there; None where it works,
@@ -156,7 +156,7 @@ def _selection(daemons: Mapping[str, Path]) -> str | None:
 
 
 def _selection_problem(gpus: tuple[Gpu, ...], selection: str | None) -> str | None:
-    """Why a selection is none of these GPUs, as CUDA does not say; None where there are none."""
+    """Why a selection is none of these GPUs, which CUDA does not report; None without one."""
     if selection is None or not gpus:
         return None
     for entry in _entries(selection):
@@ -207,7 +207,7 @@ def _operator_daemon(program: Path) -> tuple[Path | None, str | None]:
 
 
 def _given_daemons() -> dict[str, Path]:
-    """What `DAEMONS_VARIABLE` says; nothing if it is not valid."""
+    """The daemons in `DAEMONS_VARIABLE`; none if it is not valid."""
     with suppress(ValueError):
         given = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
         if isinstance(given, dict):

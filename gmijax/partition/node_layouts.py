@@ -33,7 +33,7 @@ class NodeLayout(NamedTuple):
 
     @contextmanager
     def named(self) -> Iterator[None]:
-        """Puts the node before what an error says."""
+        """Puts the node before the message of an error."""
         try:
             yield
         except ConfigError as error:

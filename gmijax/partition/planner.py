@@ -184,7 +184,7 @@ def _self_check(
 ) -> bool:
     if plan.self_check != "auto":
         return plan.self_check == "on"
-    # A daemon of somebody else may cap all its clients by default, and does not say so.
+    # An existing daemon may cap all its clients by default, and does not report it.
     # In a job of a pack the pack's daemon counts as one of these; that costs a matrix product.
     is_theirs = backend == "mps" and any(node.machine.operator_daemon for node in of_nodes)
     return is_theirs or any((allocation.sm_percent or 100.0) < 100.0 for allocation in allocations)

@@ -91,7 +91,7 @@ def has_role(roles: str, role: str) -> bool:
 
 
 def group_of(layout: Layout, roles: Iterable[str], role: str) -> Group | None:
-    """The GMIs whose roles include `role`, None if nobody has it."""
+    """The GMIs whose roles include `role`, None if no GMI has it."""
     gmis = tuple(gmi for gmi, theirs in enumerate(roles) if has_role(theirs, role))
     if not gmis:
         return None

@@ -32,7 +32,7 @@ LEAST_UPRIGHT: Final = 0.99
 MOST_LINEAR_ERROR_M_PER_S: Final = 0.25
 MOST_YAW_ERROR_RAD_PER_S: Final = 0.25
 MOST_LEFT: Final = 0.5
-"""Most of the environments that may leave the field: the others say how the policy walks."""
+"""Most of the environments that may leave the field: the others show how the policy walks."""
 
 LEAST_ENVS: Final = 100
 """With fewer environments 99 % cannot be distinguished from less, and the test does not decide."""

@@ -20,7 +20,7 @@ def record_git(run: RunPaths, folder: Path) -> None:
 
     `git.json` has the commit, the branch, the lines of `git status` and whether they or the diff
     were cut off; `git.diff` the changes of tracked files, at most MAX_DIFF_BYTES. A folder that
-    cannot be written to is left to those who must write into it.
+    cannot be written to raises no error here: others that must write into it do.
     """
     commit = _git(folder, "rev-parse", "HEAD", limit=100)
     if not commit:

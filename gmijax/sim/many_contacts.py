@@ -1,4 +1,4 @@
-"""Says how many contacts a model can have, before minutes go into compiling for all of them."""
+"""Warns how many contacts a model can have, before minutes go into compiling for all of them."""
 
 from __future__ import annotations
 

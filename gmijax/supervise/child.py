@@ -137,7 +137,7 @@ class ChildLink:
         self._part_began_s = now_s
 
     def begin_compiling(self) -> None:
-        """Says that this GMI compiles from now on."""
+        """Reports that this GMI compiles from now on."""
         self.end_part("tracing")
         self.beat("compiling", 0)
 
@@ -239,7 +239,7 @@ def _leave_signals_to_controller() -> None:
 
 
 def _end_now() -> None:
-    # No clean-up: it could wait for a peer or a GPU forever, and nobody is left who would
+    # No clean-up: it could wait for a peer or a GPU forever, and no process is left that would
     # read the outcome. Helper processes must not stay behind either.
     if os.getpgrp() == os.getpid():
         os.killpg(0, signal.SIGKILL)

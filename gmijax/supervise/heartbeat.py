@@ -1,4 +1,4 @@
-"""The heartbeat: how a GMI says how far it is and why it fails, in memory of both processes.
+"""The heartbeat: how a GMI reports its progress and why it fails, in memory of both processes.
 
 Not a file: it is written within training, where a full or a slow disk must not end or delay it.
 A block of eight 64-bit numbers (beats, state, iteration, process, bytes of the error), then the
@@ -49,7 +49,7 @@ class HeartbeatBlock:
     """Memory for the beats and the error of one GMI.
 
     Args:
-      fd: of `create`, or inherited; None for memory that nobody else reads.
+      fd: of `create`, or inherited; None for memory that no other process reads.
     """
 
     def __init__(self, fd: int | None = None) -> None:
@@ -83,7 +83,7 @@ class HeartbeatBlock:
         return Heartbeat(state, self._numbers[_ITERATION], self._numbers[_PID])
 
     def write_error(self, error: ReportedError) -> None:
-        """Says why the GMI fails; of long texts the beginning or, of a traceback, the end."""
+        """Reports why the GMI fails; of long texts the beginning or, of a traceback, the end."""
         cut = error._replace(
             message=error.message[:_MAX_MESSAGE],
             traceback=error.traceback[-_MAX_TRACEBACK:],

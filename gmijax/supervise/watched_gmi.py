@@ -65,7 +65,7 @@ class WatchedGmi(ABC):
 
     @property
     def is_ready(self) -> bool:
-        """Whether the GMI has once been ready, or has ended well without saying so."""
+        """Whether the GMI has once been ready, or has ended well without reporting it."""
         return self._was_ready or self.exit_code == 0
 
     def status(self) -> GmiStatus:

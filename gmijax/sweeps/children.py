@@ -141,7 +141,7 @@ class Child:
         """Asks it to save and end.
 
         A controller asks its GMIs. A command may be a shell, which does not pass a signal on: it
-        comes to all of its process group, as Ctrl-C does.
+        reaches all of its process group, as Ctrl-C does.
         """
         with suppress(ProcessLookupError, PermissionError):
             if not self._is_client:

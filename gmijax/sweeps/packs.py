@@ -54,7 +54,7 @@ class PackPlanner:
         self._begins.pop(job.number, None)
 
     def _begin(self, job: Job) -> int | None:
-        """The step that a job goes on from; None: it has to say itself why it cannot, or need not.
+        """The step that a job continues from; None: it need not, or reports itself why it cannot.
 
         Kept, because it takes reading whole checkpoints.
         """

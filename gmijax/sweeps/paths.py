@@ -23,7 +23,7 @@ class SweepPaths(RunPaths):
 
     def __init__(self, root: Path, name: str = "sweep") -> None:
         super().__init__(root)
-        self.request = root / "request.json"  # What was asked: a command that goes on asks it too.
+        self.request = root / "request.json"  # What a continued command must repeat.
         self.study = root / "study.log"  # Of Optuna.
         self.sweep = root / f"{name}.json"  # Jobs, their states and results.
         self.table = root / f"{name}.csv"  # One line a job.

@@ -45,7 +45,7 @@ _OF_SETTING = ("n", "interquartile_mean", "low", "high", "window_full")
 _RESERVE_BYTES = 1 << 16
 
 _MOST_TYPED_DIGITS = 8
-"""A number with a point and more digits was drawn: nobody types that."""
+"""A number with a point and more digits was sampled, not typed."""
 
 
 class JobsReport:
@@ -110,7 +110,7 @@ class JobsReport:
             self._write("running")
 
     def end(self, status: str) -> str | None:
-        """Says how the sweep has ended; why that cannot be written, if it cannot.
+        """Writes how the sweep has ended; returns why that cannot be written, if it cannot.
 
         Raises:
           FolderLost: the sweep's folder is no longer there.

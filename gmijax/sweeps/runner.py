@@ -50,7 +50,7 @@ class SweepResult(NamedTuple):
 
 
 def run_work(work: Work[J], *, show: Show = False, events: TextIO | None = None) -> SweepResult:
-    """Runs all jobs, as many at a time as the settings say, and compares them.
+    """Runs all jobs, as many at a time as the settings allow, and compares them.
 
     Called again with the same work and folder, it runs those that are not complete.
 
@@ -267,7 +267,7 @@ def _beginning(work: Work[J], paths: SweepPaths, console: Console) -> tuple[list
 
 
 def _require_same(work: Work[J], wanted: Mapping[str, Any], paths: SweepPaths) -> None:
-    """Raises ConfigError if a folder holds other jobs, or does not say which it holds."""
+    """Raises ConfigError if a folder holds other jobs, or has no record of which it holds."""
     if not paths.request.exists():
         return
     elsewhere = "give another folder"

@@ -38,7 +38,7 @@ class Scheduler(Generic[J]):
     A job that fails, or cannot be started, ends alone. But where it shared an MPS daemon, and the
     fault may have been that of another client, it is run once more, from its last checkpoint and
     alone on its GPU. Jobs with other faults that may pass, such as a machine that is gone, run
-    again, as often as their kind says.
+    again, as often as their kind allows.
 
     Args:
       jobs: those that are known; those that are `waiting` are run.

@@ -82,7 +82,7 @@ class SweepView:
         return Group(self._table(), Text(self.line())) if self._display.has_panel else None
 
     def _print_changes(self) -> None:
-        """New stages of jobs; beside the table only those that somebody may have to mend."""
+        """New stages of jobs; beside the table only those that the user may have to fix."""
         for job in self._jobs:
             before = self._stages.get(job.number, ("waiting", 0, None))
             state, _, waits_for = now = job.progress.stage

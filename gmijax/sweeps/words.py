@@ -1,4 +1,4 @@
-"""What a sweep says before its first job and after its last one."""
+"""What a sweep prints before its first job and after its last one."""
 
 from __future__ import annotations
 

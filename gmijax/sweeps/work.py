@@ -61,7 +61,7 @@ class Work(ABC, Generic[J]):
     """Of the command, and of its report."""
 
     resume_requirement: ClassVar[str]
-    """In words, what must be the same where a command goes on."""
+    """In words, what must be the same where a command continues."""
 
     def __post_init__(self) -> None:
         key, sampler = f"{self.settings.prefix}sampler", self.settings.sampler
@@ -151,7 +151,7 @@ class Work(ABC, Generic[J]):
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
-        """What must be the same where a command goes on."""
+        """What must be the same where a command continues."""
 
     def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """What is printed before the first job."""

@@ -37,7 +37,7 @@ BRIEF_FPS, BRIEF_LEAST_FPS = 15.0, 12.5
 first: with fewer frames a second nothing is seen to move."""
 
 _TRIED = 3
-"""Pictures that are timed: somebody else may use the machine during one of them."""
+"""Pictures that are timed: another process may use the machine during one of them."""
 
 _H264_CRF = "20"
 _GIF_MAX_WIDTH = 480

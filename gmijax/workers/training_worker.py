@@ -1,6 +1,6 @@
 """Main of a GMI in training: `python -m gmijax.workers.training_worker`.
 
-Started by the supervisor and by nobody else. Reads the run folder, does what the plan gives to
+Started by the supervisor only. Reads the run folder, does what the plan gives to
 this GMI, and writes `result.json` or `error.json`.
 
 With the template `tdg_ex` one GMI of every GPU trains and the others make its rollouts; in
@@ -238,7 +238,7 @@ def _trainers_communicator(
         rendezvous_timeout_s=config.run.start_timeout_s,
         intra=plan.intra,
         inter=plan.inter,
-        # Whoever asks for it by name gets an error that it does not work.
+        # If it is requested by name, the error is that it does not work.
         host_if_unavailable=config.reduce.strategy != "one_shot",
         nodes=nodes,
         listener=listener,

@@ -45,7 +45,7 @@ class LeaderWatch:
         """`beat`, and an error if another node is gone, or silent since `since_s` for too long.
 
         Raises:
-          PeerLost: a leader has hung up before it came to the next barrier.
+          PeerLost: a leader has disconnected before it reached the next barrier.
           CollectiveTimeout: nothing was received from a node for `timeout_s`.
         """
         self.beat()

@@ -126,7 +126,7 @@ def _call(nodes: NodeAddresses, node: int, lane: int, deadline_s: float) -> sock
         return call(address, key, (nodes.node, lane), lambda: deadline_s - running_s())
     except Unreachable as error:
         raise CollectiveError(
-            f"node {nodes.node} cannot reach {where} ({error}); cluster.interface says which "
+            f"node {nodes.node} cannot reach {where} ({error}); cluster.interface sets the "
             "network to use"
         ) from None
     except OSError as error:

@@ -47,7 +47,7 @@ def compile_kernels(mj_model: mujoco.MjModel) -> None:
         variants = launched_by(lambda: mujoco_warp.step(model, data))
 
     def load(variant: Variant) -> None:
-        with suppress(Exception):  # A kernel that is launched says so again.
+        with suppress(Exception):  # A launch of the kernel raises it again.
             warp.force_load(device, [variant.module], block_dim=variant.block_dim, max_workers=0)
 
     num_threads = max(1, min(len(variants), len(os.sched_getaffinity(0))))
@@ -90,7 +90,7 @@ def _noting(found: dict[Variant, None]) -> Iterator[None]:
         return _ANY_SIZE
 
     def nothing(*_: Any, **__: Any) -> None:
-        """Sorts and scans would read arrays that nobody has computed."""
+        """Sorts and scans would read arrays that were not computed."""
 
     with (
         _replaced(warp.Module, load=load),

@@ -25,7 +25,7 @@ _EQUALITY_ROWS = {
     int(mujoco.mjtEq.mjEQ_JOINT): 1,
     int(mujoco.mjtEq.mjEQ_TENDON): 1,
 }
-"""Rows of an equality constraint; those of a flex have as many as MuJoCo says."""
+"""Rows of an equality constraint; those of a flex have as many as in MuJoCo."""
 
 
 class Bounds(NamedTuple):

@@ -1,8 +1,8 @@
 """Backends of GPUs: GMIs run at the same time under NVIDIA's Multi-Process Service, or do not.
 
 One daemon per GPU (or shared MIG instance), with a pipe directory of its own: a fatal fault of one
-client ends every client of its server, so GPUs must not share a server. A daemon that somebody
-else has started is used and never stopped.
+client ends every client of its server, so GPUs must not share a server. A daemon that gmijax has
+not started is used and never stopped.
 """
 
 from __future__ import annotations
@@ -249,7 +249,7 @@ class MigBackend(MpsBackend):
             for allocation in here
             if sharing[allocation.device] > 1 or allocation.device in machine.daemons
         ]
-        # A daemon of somebody else is for other devices than the job's instances.
+        # An existing daemon is for other devices than the job's instances.
         own_only = dataclasses.replace(machine, operator_daemon=None)
         super().__init__(plan, own_only, run, clients)
 
