@@ -1,7 +1,7 @@
 """A clock for time limits, which stands still while this process does. Stdlib only.
 
 A process may be stopped as a whole: `scontrol suspend`, `docker pause`, Ctrl-Z, a snapshot of a
-virtual machine. To whoever only compares times everybody else then looks as if it had hung.
+virtual machine. If times are only compared, all other processes then seem to have hung.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import Final
 LONGEST_LOOK_S: Final = 1.0
 """Between two looks at the clock no more than this counts.
 
-Whoever waits looks far more often. So a process that runs, on a busy machine too, loses little.
+Waits look far more often. So a process that runs, on a busy machine too, loses little.
 """
 
 
 class RunningClock:
-    """Seconds that go on while this process looks at them; from any thread."""
+    """Seconds that are counted while this process looks at them; from any thread."""
 
     def __init__(self) -> None:
         self._looked_s = time.monotonic()
@@ -44,7 +44,7 @@ class RunningClock:
 
 
 running_s: Final = RunningClock()
-"""The clock of this process. Whoever waits by it looks at it at least twice a second."""
+"""The clock of this process. A wait by it looks at it at least twice a second."""
 
 
 def wait_for(wait: Callable[[float], bool], timeout_s: float) -> bool:

@@ -57,7 +57,7 @@ def _demo(argv: Sequence[str]) -> None:
 
 
 def demo(overrides: Sequence[str]) -> None:
-    """Plays and films; then trains with `overrides`, or if the user says so.
+    """Plays and films; then trains with `overrides`, or if the user agrees.
 
     Raises:
       ConfigError: bad input, before anything was started.
@@ -146,7 +146,7 @@ def _told(task: str, returns: dict[str, Any]) -> list[str]:
 
 
 def _is_wanted() -> bool:
-    """Whether the user at the terminal wants a training; nobody is asked without one."""
+    """Whether the user at the terminal wants a training; no question without a terminal."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         return False
     how_long = (

@@ -14,7 +14,7 @@ from jax.sharding import Sharding, SingleDeviceSharding
 from gmijax.errors import ConfigError
 
 PEAKS_BESIDE_JAX: list[Callable[[], int]] = []
-"""Each returns how many bytes of this process's GPU somebody had at most beside JAX."""
+"""Each returns the peak bytes of this process's GPU that a library other than JAX had."""
 
 
 def start_device() -> None:
@@ -53,7 +53,7 @@ def host_sharding() -> Sharding | None:
 
 
 def memory_limit_bytes() -> int | None:
-    """What this process's device gives it at most; None where the device does not say."""
+    """The most memory that this process's device gives it; None where that is unknown."""
     return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit")
 
 

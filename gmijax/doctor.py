@@ -143,10 +143,10 @@ def show_nodes(address: str, *, as_json: bool) -> Sequence[str]:
         data |= {"problems": problems, "notes": notes}
         write_output(json.dumps(data, indent=2) + "\n")
     else:
-        said = [*lines_of_nodes(nodes), *(f"note: {note}" for note in notes)]
-        said += [f"problem: {problem}" for problem in problems]
-        said += [] if problems else ["a job can be on all of them"]
-        write_output("\n".join(said) + "\n")
+        lines = [*lines_of_nodes(nodes), *(f"note: {note}" for note in notes)]
+        lines += [f"problem: {problem}" for problem in problems]
+        lines += [] if problems else ["a job can be on all of them"]
+        write_output("\n".join(lines) + "\n")
     return problems
 
 

@@ -29,11 +29,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 TERMINAL_COMMAND = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[ -~])")
-"""What a terminal obeys and does not show: colours, the cursor, its title."""
+"""Commands to a terminal, which it does not show: colours, the cursor, its title."""
 
 
 def printable(text: str) -> str:
-    """One line of somebody's output without what a terminal would obey.
+    """One line of a program's output without commands to a terminal.
 
     Commands of terminals and control characters go, among them those that turn the direction of
     writing; tabs become blanks.
@@ -43,7 +43,7 @@ def printable(text: str) -> str:
 
 
 def lines_of(error: BaseException) -> list[str]:
-    """The lines of what an error says that are not empty; its type's name if it says nothing."""
+    """The lines of an error's message that are not empty; its type's name if it has none."""
     lines = [line.strip() for line in str(error).splitlines()]
     return [line for line in lines if line] or [type(error).__name__]
 
@@ -60,7 +60,7 @@ def gist_of(text: str) -> str:
 
 
 def with_type(kind: str, message: str) -> str:
-    """`ValueError: message`; the type's name alone where an error says nothing."""
+    """`ValueError: message`; the type's name alone where an error has no message."""
     return f"{kind}: {message}" if message else kind
 
 
@@ -89,7 +89,7 @@ class MissingKey(ConfigError):
 
 
 class DamagedFile(ConfigError):
-    """A file of a run cannot be read, or is not what its name says.
+    """A file of a run cannot be read, or its content is not of the kind that its name promises.
 
     Attributes:
       cause: why, without the file.
@@ -101,7 +101,7 @@ class DamagedFile(ConfigError):
 
 
 class BackendUnavailable(ConfigError):
-    """The wanted backend cannot be had on this machine; the message says what is missing."""
+    """The requested backend is unavailable on this machine; the message names what is missing."""
 
 
 class FolderLost(GmijaxError):
@@ -205,11 +205,11 @@ class ParameterMismatch(GmijaxError):
 
 
 class SelfCheckFailed(GmijaxError):
-    """Matrix products are wrong on the share of a GMI; the message says which, and the share."""
+    """Matrix products are wrong on the share of a GMI; the message names them and the share."""
 
 
 class NonFiniteError(GmijaxError):
-    """A loss, gradient or simulation became NaN or infinite; the message says where."""
+    """A loss, gradient or simulation became NaN or infinite; the message has the location."""
 
 
 class JobNotStarted(GmijaxError):

@@ -27,7 +27,7 @@ Lists the tasks with the lengths of their observations and actions, and the suit
 
 
 class Task(NamedTuple):
-    """What is known of a task without jax; None for what its module does not say as a number."""
+    """What is known of a task without jax; None for what its module does not have as a number."""
 
     name: str
     obs_size: int | None

@@ -75,10 +75,10 @@ class Product(NamedTuple):
 
 
 def check_share(plan: Plan, gmi: int) -> float:
-    """Checks this GMI's share if the plan says so; returns the time it took in seconds.
+    """Checks this GMI's share if the plan requests it; returns the time it took in seconds.
 
     Raises:
-      SelfCheckFailed: a product is wrong; says which, how much, and the share.
+      SelfCheckFailed: a product is wrong; names it, by how much, and the share.
     """
     if not plan.self_check:
         return 0.0

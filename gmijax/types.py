@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 if TYPE_CHECKING:
     import jax
 
-# As texts, so that who names types need not load jax.
+# As texts, so that modules that name types need not load jax.
 Array: TypeAlias = "jax.Array"
 """One array on a device."""
 

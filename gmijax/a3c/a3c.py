@@ -200,7 +200,7 @@ def update(
     state, losses, rates = run_updates(
         learner, collectives, gradients, state, batch, targets, order, after=everyone
     )
-    # Counts the batch, which makes a new version of the policy, and takes in its statistics.
+    # Counts the batch, which makes a new version of the policy, and adds its statistics.
     state = finish_iteration(learner, state, seen)
     weights = pack_weights(acting_weights(learner, state))
     means = jax.tree.map(jnp.mean, losses)

@@ -1,8 +1,8 @@
 """The role of a serving GMI: simulator and agent in one.
 
-It acts with the newest weights that were published, sends what came of it, and goes on. Trainers
-never make it wait, except for room. Newer weights are taken up within unrolls too: the less old
-what a policy learns from is, the fewer steps it takes.
+It acts with the newest published weights, sends the experience, and acts again. It waits for
+trainers only while the channel is full. It also takes newer weights in the middle of an unroll:
+the fresher its experience, the fewer steps a policy needs.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from gmijax.types import Array
 _PAUSE_S = 0.02
 _POLL_S = 0.0002
 _SLICE_S = 0.5
-"""Longest wait for room before the agent looks for orders again."""
+"""Longest wait for space before the agent looks for commands again."""
 
 
 class _PendingRollout(NamedTuple):
@@ -129,7 +129,7 @@ class Agent:
     ) -> None:
         pending: _PendingRollout | None = None
         unpack = jax.jit(lambda packed: unpack_weights(weights, packed))
-        while not self._obey(env_state):
+        while not self._handle_command(env_state):
             weights = self._newest(weights, unpack)
             version = self._version  # Of the oldest weights that make this unroll.
             pieces: list[tuple[Unrolls, Counts]] = []
@@ -179,18 +179,18 @@ class Agent:
         self.link.beat("running", self._unrolls)
 
     def _hand_over(self, unrolls: Unrolls, version: int, env_state: BatchState) -> bool:
-        """Sends an unroll; False if the job ends and nobody wants it any more."""
+        """Sends an unroll; False if the job ends and no trainer needs it any more."""
         limit_s, started = self.config.reduce.timeout_s, running_s()
         try:
             while not self._offer(unrolls, version, env_state):
-                # Trainers that wait for a checkpoint make no room until it is complete.
-                if self._obey(env_state):
+                # Trainers that wait for a checkpoint free no space until it is complete.
+                if self._handle_command(env_state):
                     return False
                 if running_s() - started > limit_s:
                     raise self._late("send", limit_s)
                 self.link.beat("running", self._unrolls)
         except PipeClosed:
-            if not self._obey(env_state):
+            if not self._handle_command(env_state):
                 raise
             return False
         return True
@@ -222,7 +222,7 @@ class Agent:
                 self._wait_s += time.monotonic() - now_s
         return False
 
-    def _obey(self, env_state: BatchState) -> bool:
+    def _handle_command(self, env_state: BatchState) -> bool:
         """Adds to the checkpoint that is wanted, if any; returns whether the job ends."""
         self._look()
         steps = self._orders.checkpoint

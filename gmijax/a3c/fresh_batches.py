@@ -19,7 +19,7 @@ from gmijax.errors import CollectiveTimeout
 from gmijax.supervise.child import ChildLink
 
 _SLICE_S = 0.5
-"""Longest wait for experience before the trainer says that it is alive."""
+"""Longest wait for experience before the trainer sends a heartbeat."""
 
 
 class FreshBatch(NamedTuple):

@@ -1,4 +1,4 @@
-"""What trainers and agents publish for each other, in registers that nobody ever waits for.
+"""What trainers and agents publish for each other, in registers that never block.
 
 Register 0: orders of the leading trainer. Register 1: the newest weights, with the policy's
 version as tag. Then one per agent: what it has done so far. Experience travels elsewhere. On
@@ -45,9 +45,9 @@ class AgentReport(NamedTuple):
       checkpoint: environment steps of the latest checkpoint that it has added to, or None.
       env_steps: environment steps acted upon: predictions.
       bytes_sent: of experience.
-      send_s: seconds spent on sending, with waits for room.
-      wait_s: those of them in which it waited for room and had nothing to compute.
-      occupancy: fraction of the room for experience that was full, after the last send.
+      send_s: seconds spent on sending, with waits for space.
+      wait_s: those of them in which it waited for space and had nothing to compute.
+      occupancy: fraction of the space for experience that was full, after the last send.
       stats: [M] sums over all its unrolls, see `gmijax.learning.unroll.Counts`.
     """
 

@@ -65,7 +65,7 @@ class Leader:
     def start(self, weights: npt.NDArray[np.float32], version: int) -> None:
         """Lets the agents begin, with the weights of `version`."""
         self.publish(weights, version)
-        self._order(None, is_ending=False)
+        self._send_command(None, is_ending=False)
 
     def publish(self, weights: npt.NDArray[np.float32], version: int) -> None:
         """Gives agents new weights [W]; never waits for them."""
@@ -84,30 +84,30 @@ class Leader:
         self.env_steps, self._updates = env_steps, updates
         self._reporter.add(counts, updated, update_s)
         if self._reporter.is_due:
-            self._hear()
+            self._read_reports()
             self._write_line(state)
 
     def checkpoint_now_and_then(self, state: TrainState) -> None:
         """Begins a checkpoint when one is due, finishes one when all agents have done theirs.
 
-        Nobody waits: the agents add their environments when they look. Until then no other
+        Nothing waits: the agents add their environments when they look. Until then no other
         checkpoint is begun.
         """
         every = self.config.run.checkpoint_every
         if self._pending is not None:
-            self._hear()
+            self._read_reports()
             if not self._missing():
                 self._finish_checkpoint()
         elif every and self._updates % every == 0:
             self._begin_checkpoint(state)
-            self._order(self.env_steps, is_ending=False)
+            self._send_command(self.env_steps, is_ending=False)
 
     def end(self) -> None:
-        """Tells the agents to add to the last checkpoint and to end."""
+        """Makes the agents add to the last checkpoint and end."""
         if self._pending is not None:  # It would be given up for this one: see it through.
             self._wait_for_agents()
             self._finish_checkpoint()
-        self._order(self.env_steps, is_ending=True)
+        self._send_command(self.env_steps, is_ending=True)
 
     def finish(self, state: TrainState) -> None:
         """Writes the last checkpoint and the last line of metrics."""
@@ -154,10 +154,10 @@ class Leader:
             {name: float(value) for name, value in policy_figures(state).items()},
         )
 
-    def _order(self, checkpoint: int | None, *, is_ending: bool) -> None:
+    def _send_command(self, checkpoint: int | None, *, is_ending: bool) -> None:
         self.registers.orders.publish(AgentCommand(checkpoint, is_ending).pack())
 
-    def _hear(self) -> None:
+    def _read_reports(self) -> None:
         for index, register in enumerate(self.registers.reports):
             if (snapshot := register.read(self._seen[index])) is not None:
                 self._seen[index] = snapshot.count
@@ -182,7 +182,7 @@ class Leader:
         """
         limit_s = self.config.reduce.timeout_s
         started = running_s()
-        self._hear()
+        self._read_reports()
         while missing := self._missing():
             if running_s() - started > limit_s:
                 raise CollectiveTimeout(
@@ -190,7 +190,7 @@ class Leader:
                 )
             self.link.beat("running", self._updates)
             time.sleep(_PAUSE_S)
-            self._hear()
+            self._read_reports()
 
     def _finish_checkpoint(self) -> None:
         assert self._pending is not None

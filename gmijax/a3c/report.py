@@ -73,7 +73,7 @@ class Reporter:
         return time.monotonic() - self.log.last_s >= LINE_EVERY_S
 
     def add(self, counts: BatchCounts, updated: UpdateResult, update_s: float) -> None:
-        """Takes in one update, of so many seconds."""
+        """Adds one update, of so many seconds."""
         self._updates.append((updated, update_s, counts.receive_s))
         self._stale += counts.stale
         self._recent += counts.staleness

@@ -14,7 +14,7 @@ class Returns(NamedTuple):
     """Targets for the networks, [T, N] each.
 
     Attributes:
-      value: what the value function should have said.
+      value: the target of the value function.
       advantage: how much better the action was than expected.
       rho: weight of a step in the policy gradient, 1 where nothing is corrected.
     """

@@ -62,7 +62,7 @@ class Targets(NamedTuple):
       log_prob: [T, B], of the actions under that policy.
       value: [T, B], target of the value function.
       advantage: [T, B], normalised if that is wanted.
-      step_weight: [T, B] of the policy gradient: V-trace's, and 0 where `_is_learnt` says so.
+      step_weight: [T, B] of the policy gradient: V-trace's, and 0 where `_is_learnt` is true.
       behaviour_kl: [], its estimated divergence from the policies that acted, in nats.
       fit: moments of the values' targets, and of these minus the values.
       value_moments: see `TrainState`.

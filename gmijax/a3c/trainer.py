@@ -134,7 +134,7 @@ class Trainer:
         if leader is not None:
             leader.end()
         require_equal(self.comm, self.link.gmi, state.params, self._env_steps)
-        # Agents that wait for room may go: the order to end is published by now.
+        # Agents that wait for space may end: the command to do so is published by now.
         self.receiver.close()
         if leader is not None:
             leader.finish(state)

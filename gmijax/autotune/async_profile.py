@@ -1,4 +1,4 @@
-"""When a profile of an asynchronous job can be read, and what it says."""
+"""When a profile of an asynchronous job can be read, and its result."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FEWEST_LINES: Final = 3
 """Lines of metrics that a profile goes by, each of half a second or of one batch."""
 
 MOST_IDLE: Final = 0.95
-"""Agents that wait longer than this part of their time say little of what they could do."""
+"""Agents that wait longer than this part of their time do not show how fast they could be."""
 
 Line = Mapping[str, Any]
 
@@ -74,7 +74,7 @@ def measured_of(lines: Sequence[Line], num_agents: int, memory_mib: float) -> Me
     """Rates of one serving GMI, and of a serving and a training GPU, from a profile.
 
     Trainers could learn from TTOP x (update + wait for a batch) / update, agents could make PPS /
-    (1 - the part of their time for which they had to wait for room). `lines` are those that
+    (1 - the part of their time for which they had to wait for space). `lines` are those that
     `window_start` names, and the one before them.
     """
     before, *seen = lines

@@ -5,7 +5,7 @@ acts and one that trains.
 
 The paper divides the GPUs of such a job by hand (section 5.1, decoupled). Here the division
 follows from what one serving and one training GPU can do: trainers learn from nothing that was
-not made, and nobody makes what will not be taken, so that s and t of them make
+not made, and no agent makes what will not be taken, so that s and t of them make
 min(s acting, t learning) environment steps a second. TTOP cannot exceed PPS.
 """
 
@@ -51,7 +51,7 @@ class A3cWorkload(Workload[TrainConfig]):
         self._counts = Split(len(serving), len(training))
         self._is_apart = _is_apart(serving, training, indices)
         is_auto = config.plan.gmis_per_gpu == AUTO
-        # In one place, and without what a profile does not depend on.
+        # As one object, and without what a profile does not depend on.
         self.plan = dataclasses.replace(
             given,
             gpus=indices or len({*serving, *training}),

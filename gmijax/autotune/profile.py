@@ -23,7 +23,7 @@ from gmijax.supervise.watched_gmi import GmiStatus
 
 
 class ProfileLate(Exception):
-    """A profile did not end within its time limit; says how far its GMIs were."""
+    """A profile did not end within its time limit; the message has the progress of its GMIs."""
 
 
 def profile(
@@ -58,7 +58,7 @@ def profile(
         raise
     except GmijaxError as error:
         return NotRunnable(" ".join(str(error).split()))
-    # All GMIs ended well, and still their results do not say what they should.
+    # All GMIs ended well, and still their results lack what they should have.
     except (OSError, ArithmeticError, LookupError, TypeError, ValueError) as error:
         return NotRunnable(f"no result to read: {type(error).__name__}: {error}")
     finally:

@@ -46,7 +46,7 @@ class SearchDisplay:
         return self
 
     def begin(self) -> None:
-        """Says once what takes the time, before the first profile that is not in the store."""
+        """Prints once what takes the time, before the first profile that is not in the store."""
         if not self._has_begun:
             self._has_begun = True
             self._console.print(
@@ -78,24 +78,24 @@ def verdict(outcome: SearchOutcome, grid: Grid, num_gpus: int, split: Split | No
     several = _highest(outcome, lambda gmis: gmis > 1)
     one = _highest(outcome, lambda gmis: gmis == 1)
     gpus = "" if num_gpus == 1 else f" on {num_gpus} GPUs (projected from one)"
-    said = f"{_answer(top, split)}, {top.point.impl}: {top.projected:,.0f} env steps/s"
-    said += gpus if split is None else _reason_of(split, top)
+    text = f"{_answer(top, split)}, {top.point.impl}: {top.projected:,.0f} env steps/s"
+    text += gpus if split is None else _reason_of(split, top)
     gmi = "serving GMI" if top.point.trainers else "GMI"
     if top.point.gmis_per_gpu == 1 and several is not None:
-        said += (
+        text += (
             f"; one {gmi} is enough here: the best with several, {several.point}, makes "
             f"{several.projected / top.projected:.2f} of that"
         )
     elif top.point.gmis_per_gpu > 1 and one is not None:
-        said += f"; {top.projected / one.projected:.2f} times the best with one {gmi}, {one.point}"
+        text += f"; {top.projected / one.projected:.2f} times the best with one {gmi}, {one.point}"
         if one.point.num_envs == max(grid.num_envs):
-            said += (
+            text += (
                 ", the most environments that it was given: with more it may come closer "
                 "(search.num_envs)"
             )
     if not outcome.complete:
-        said += f"; the budget ended the search after {len(outcome.visited)} points"
-    return said
+        text += f"; the budget ended the search after {len(outcome.visited)} points"
+    return text
 
 
 def table(outcome: SearchOutcome) -> Table:
@@ -204,7 +204,7 @@ def _highest(outcome: SearchOutcome, wanted: Any) -> SearchPoint | None:
 
 
 def _answer(top: SearchPoint, split: Split | None) -> str:
-    """Who is where, in words."""
+    """Which GMIs are where, in words."""
     point = top.point
     envs = f"{point.num_envs} environments each"
     if not point.trainers:

@@ -6,7 +6,7 @@ one that runs training jobs, tests give it a formula. What the lines of the pape
 - 2, 4: every number of GMIs, 10 ... 1, with every num_env, 128 ... 16384. The same grid; first
   every third row with the largest size and the third below it, then the neighbours of the best
   point, until none of them is better.
-- 5: `profile` says whether a point runs, its throughput and memory. The same, and physics
+- 5: `profile` returns whether a point runs, its throughput and memory. The same, and physics
   implementations are a further dimension.
 - 6-8: what cannot run is skipped. The same.
 - 9-12: the first point of a row that runs starts the comparison and is no candidate. Here it is

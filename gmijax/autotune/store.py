@@ -1,7 +1,7 @@
 """The profile store: what profiles of searches and sweeps found, for the next.
 
 One JSON file for a device, a task with its settings, and the versions of what computes. It is
-written after every profile: what was interrupted goes on from there, and a second search of the
+written after every profile: what was interrupted continues from there, and a second search of the
 same job measures nothing.
 """
 
@@ -89,10 +89,10 @@ class ProfileStore:
     def put(self, kind: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
         """Keeps what a point did, in the file too; raises as `kept_or`."""
         if isinstance(result, NotRunnable):
-            said = {"not_runnable": result.reason, "limit_s": result.limit_s, "wall_s": wall_s}
+            fields = {"not_runnable": result.reason, "limit_s": result.limit_s, "wall_s": wall_s}
         else:
-            said = {**result._asdict(), "wall_s": wall_s}
-        record = {key: value for key, value in said.items() if value is not None}
+            fields = {**result._asdict(), "wall_s": wall_s}
+        record = {key: value for key, value in fields.items() if value is not None}
         try:
             with _locked(self.path.with_suffix(".lock")):
                 # What another search has found meanwhile stays.

@@ -1,7 +1,7 @@
 """A search for `num_envs` and `plan.gmis_per_gpu`, by profiling.
 
 The rules are in `gmijax.autotune.search`, a single profile in `gmijax.autotune.profile`. Here
-they meet the profile store, the time budget and the console.
+they are combined with the profile store, the time budget and the console.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ class Search:
             "versions": versions_of(VERSIONS),
         }
         self._console.print(table(outcome))
-        self._console.print(reason)  # Before the files, for which there may be no room.
+        self._console.print(reason)  # Before the files: the disk may be full.
         if self.run is not None:
             write_json(self.run.search_report, report)
             draw(outcome, self.run.search_png, f"{label}, {device}")
@@ -183,7 +183,7 @@ class Search:
         try:
             self._workload.plan_at(point, self._machine)
         except ConfigError as error:
-            # Not kept: there may be more room, or another driver, next time.
+            # Not kept: there may be more memory, or another driver, next time.
             refused = NotRunnable(str(error))
             self._display.done(point, refused, 0.0)
             return refused
@@ -218,7 +218,7 @@ class Search:
             )
         except ProfileLate as late:
             if limit_s < self._settings.profile_limit_s:
-                # Cut off, which says nothing about the point.
+                # Cut off, which is no result of the point.
                 raise OutOfBudget from None
             return NotRunnable(str(late), limit_s)
         except JobInterrupted as error:

@@ -1,4 +1,4 @@
-"""Jobs that a search can profile: what a profile runs, and what it says."""
+"""Jobs that a search can profile: what a profile runs, and its result."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class Workload(ABC, Generic[C]):
         return make_plan(one_gpu, self.reduce, point.num_envs, machine, template=self.template)
 
     def enough(self, plan: Plan, run: RunPaths) -> Callable[[Sequence[GmiStatus]], bool] | None:
-        """What says when a profile can be read; None: it ends by itself."""
+        """What decides when a profile can be read; None: it ends by itself."""
         del plan, run
         return None
 
@@ -148,7 +148,7 @@ class Workload(ABC, Generic[C]):
         return f"{chosen.name}, {chosen.memory_mib} MiB"
 
     def store_key(self, machine: Machine) -> dict[str, Any]:
-        """Everything but the point that decides what a profile says; see `ProfileStore`."""
+        """Everything but the point on which a profile's result depends; see `ProfileStore`."""
         plan, reduce = to_dict(self.plan), to_dict(self.reduce)
         for name in ("gpus", "gmis_per_gpu", "layout"):
             del plan[name]

@@ -1,7 +1,7 @@
 """`search.order=as_printed`: Algorithm 2 of the paper (section 5.2) as it is printed.
 
-Physics implementations are a further loop around it. What `gmijax.autotune.search` does otherwise
-is said there, line by line.
+Physics implementations are a further loop around it. `gmijax.autotune.search` lists what it does
+differently, line by line.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ class _Peer:
         return self._reader.get(self._timeout_s)
 
     def close(self) -> None:
-        """Says that nothing more will be sent."""
+        """Marks the end of what is sent."""
         self._writer.close()
 
 

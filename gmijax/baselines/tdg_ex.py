@@ -102,7 +102,7 @@ class RemoteIteration:
         self._step.wait()
 
     def close(self) -> None:
-        """Tells those that serve to end."""
+        """Makes the serving GMIs end."""
         for gmi in self._workers.gmis:
             self._workers.mail.send(None, gmi)
 
@@ -124,7 +124,7 @@ def serve_rollouts(
     trainer: int,
     on_state: Callable[[GmiState, int], None],
 ) -> int:
-    """Makes rollouts for `trainer` until it says that it needs no more; returns how many.
+    """Makes rollouts for `trainer` until it needs no more; returns how many.
 
     `env_state` is the environments' state at the start and donated; `on_state` is called with
     `compiling`, `ready` or `running`, and the number of rollouts made.

@@ -59,8 +59,8 @@ class Batcher:
         once read of it.
 
         After any error nothing is lost: what had arrived is in the next batch. An agent that is
-        gone is named at most five times a second, also while others still send; who can do
-        without it goes on.
+        gone is named at most five times a second, also while others still send; a caller may
+        catch the error and continue without it.
 
         Raises:
           CollectiveTimeout: too few came in time.
@@ -91,7 +91,7 @@ class Batcher:
         return batch
 
     def close(self) -> None:
-        """Tells the agents that nothing more is wanted. Idempotent."""
+        """Makes the agents stop: nothing more is read. Idempotent."""
         self._held.close()
 
     def _await_rollouts(self, deadline_s: float, timeout_s: float) -> Rollouts:
@@ -203,14 +203,14 @@ class Stack:
         return Rollouts(self.spec, self._so_far(), versions.copy(), agents.copy())
 
     def _begin(self) -> None:
-        """Makes room for a batch; the last one's memory may be used again."""
+        """Prepares memory for a batch; that of the last one may be used again."""
         self._arrays = self._arrays or {
             channel.name: np.empty(channel.full_shape(self.size), channel.dtype)
             for channel in self.spec.channels
         }
 
     def _put(self, name: str, low: int, high: int, array: Array) -> None:
-        """Takes in rollouts `low` to `high` of a channel."""
+        """Adds rollouts `low` to `high` of a channel."""
         self._arrays[name][:, low:high] = array
 
     def _so_far(self) -> dict[str, Array]:
@@ -219,7 +219,7 @@ class Stack:
 
 
 def _read_only(array: Array) -> Array:
-    """A view that nobody can write into; of an array on a device nobody can anyway."""
+    """A read-only view; an array on a device is read-only anyway."""
     if not isinstance(array, np.ndarray):
         return array
     view = array.view()

@@ -7,7 +7,7 @@ so that a piece is copied once, from the agent's arrays to where the trainer rea
 All channels of a piece travel in one transfer: a trainer can use none without the others, and a
 process that is killed leaves the whole of a transfer or nothing of it.
 
-The table is [2 + room] int64: room for so many environments, how many there are, and the policy
+The table is [2 + capacity] int64: the capacity in environments, how many there are, and the policy
 version of each.
 """
 
@@ -35,7 +35,7 @@ WORTH_IT = 0.95
 class TransferSize:
     """Doubles `num_bytes` as long as a byte gets cheaper, then keeps the best.
 
-    The price of a transfer is fixed plus so much a byte, so that there is no use in going on
+    The price of a transfer is fixed plus so much a byte, so that there is no use in continuing
     once it has stopped falling; larger transfers only make experience older.
     """
 
@@ -47,7 +47,7 @@ class TransferSize:
         self._best: tuple[float, int] | None = None
 
     def record(self, num_bytes: int, seconds: float) -> None:
-        """Takes note of what one transfer cost, without the time it waited for room."""
+        """Records the cost of one transfer, without the time it waited for space."""
         if self.is_tuned or not num_bytes:
             return
         self._samples.append(seconds / num_bytes)
@@ -82,20 +82,20 @@ class Compressor:
         self._spent_s = 0.0
 
     def try_add(self, piece: Rollouts) -> bool:
-        """Puts `piece` into a transfer, if there is room; hands the transfer over when full."""
+        """Puts `piece` into a transfer, if there is space; hands the transfer over when full."""
         if self._writer is not None and not self._takes(piece):
             self.flush()
         if self._writer is None and not self._begin(piece):
             return False
         started_s = time.perf_counter()
-        room, low = self._table[:TABLE_HEAD].tolist()
+        capacity, low = self._table[:TABLE_HEAD].tolist()
         high = low + piece.num_envs
         for name, array in piece.experience.items():
             self._arrays[name][:, low:high] = array
         self._table[TABLE_HEAD + low : TABLE_HEAD + high] = piece.versions
         self._table[1] = high
         self._spent_s += time.perf_counter() - started_s
-        if high == room:
+        if high == capacity:
             self.flush()
         return True
 
@@ -110,16 +110,17 @@ class Compressor:
         self._size.record(num_bytes, self._spent_s + time.perf_counter() - started_s)
 
     def _takes(self, piece: Rollouts) -> bool:
-        room, filled = self._table[:TABLE_HEAD].tolist()
-        return piece.spec == self._spec and filled + piece.num_envs <= room
+        capacity, filled = self._table[:TABLE_HEAD].tolist()
+        return piece.spec == self._spec and filled + piece.num_envs <= capacity
 
     def _begin(self, piece: Rollouts) -> bool:
-        """Opens a transfer for pieces of this size; False if no trainer has room."""
+        """Opens a transfer for pieces of this size; False if no trainer has space."""
         piece_bytes = piece.num_bytes + VERSION_BYTES * piece.num_envs
-        wanted = min(self._size.num_bytes, self._max_transfer_bytes)
-        room = piece.num_envs * max(1, wanted // piece_bytes)
+        target_bytes = min(self._size.num_bytes, self._max_transfer_bytes)
+        capacity = piece.num_envs * max(1, target_bytes // piece_bytes)
         head = piece.spec.encode()
-        sizes = [head.size, 8 * TABLE_HEAD + VERSION_BYTES * room, *piece.spec.sizes(room)]
+        table_bytes = 8 * TABLE_HEAD + VERSION_BYTES * capacity
+        sizes = [head.size, table_bytes, *piece.spec.sizes(capacity)]
         opened = self._migrator.try_open(sizes)
         if opened is None:
             return False
@@ -127,8 +128,8 @@ class Compressor:
         views[0][:] = head
         self._table = views[1].view(np.int64)
         self._table[:] = 0
-        self._table[0] = room
-        self._spec, self._arrays = piece.spec, piece.spec.arrays_in(views[2:], room)
+        self._table[0] = capacity
+        self._spec, self._arrays = piece.spec, piece.spec.arrays_in(views[2:], capacity)
         self._spent_s = 0.0
         return True
 
@@ -137,8 +138,8 @@ def read_transfer(message: Message, agent: int) -> Rollouts:
     """What a `Compressor` of this agent made; a `Decode`. Its arrays are views of the message."""
     head, table, *parts = message
     spec, table = Spec.decode(head), table.view(np.int64)
-    room, filled = table[:TABLE_HEAD].tolist()
-    arrays = spec.arrays_in(parts, room)
+    capacity, filled = table[:TABLE_HEAD].tolist()
+    arrays = spec.arrays_in(parts, capacity)
     return Rollouts(
         spec,
         {name: array[:, :filled] for name, array in arrays.items()},

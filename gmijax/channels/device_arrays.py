@@ -1,13 +1,13 @@
 """Arrays that stay on the GPU which sender and receiver share.
 
 A rank makes a block of GPU memory with a part for each peer. Arrays are copied there on the
-device, and a message says where they lie. What they take is free again when the receiver has
+device, and a message holds their location. What they take is free again when the receiver has
 released the message. So order, back-pressure and the discovery of the dead are the pipe's, and
 nothing but notes passes through the host. What lies in the block has no checksum.
 
 Experience is read in place (`device_channel.py`). Messages of roles are copied out
-(`DeviceBuffers`); where there is no room, and for arrays that are small or of other types, they
-travel through the host as ever.
+(`DeviceBuffers`); where there is no space, and for arrays that are small or of other types, they
+go through the host as usual.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MAX_VIEWS = 4096
 
 
 class BufferedArray(NamedTuple):
-    """Where an array lies (bytes in the block of `ipc_handle`); it travels in its place."""
+    """Where an array lies (bytes in the block of `ipc_handle`); sent instead of the array."""
 
     ipc_handle: bytes
     offset: int
@@ -58,7 +58,7 @@ def region_bytes(sizes: Iterable[int]) -> int:
 class SentArrays:
     """This rank's block of GPU memory, with `part_bytes` for the arrays on their way to each peer.
 
-    `released` says, in every method, how many of this rank's messages the peer has released.
+    `released` is, in every method, how many of this rank's messages the peer has released.
     """
 
     def __init__(self, peers: Collection[int], new_memory: NewMemory, part_bytes: int) -> None:
@@ -81,12 +81,12 @@ class SentArrays:
             self._memory = memory
         return self._memory
 
-    def has_room(self, dst: int, num_bytes: int, released: int) -> bool:
+    def has_space(self, dst: int, num_bytes: int, released: int) -> bool:
         """Whether there is a region of so many bytes for `dst`."""
         return self._gap(dst, num_bytes, released) is not None
 
     def put(self, arrays: Sequence[Any], dst: int, released: int) -> list[BufferedArray] | None:
-        """Copies arrays to where rank `dst` finds them; None: there is no room for all.
+        """Copies arrays to where rank `dst` finds them; None: there is no space for all.
 
         Raises:
           CudaError: as `make`.

@@ -44,8 +44,8 @@ class DeviceWriter(PipeWriter):
         self._sent = sent
 
     def try_reserve(self, sizes: Sequence[int]) -> list[Bytes] | None:
-        """See `PipeWriter`; None, too, while the block has no room for a rollout."""
-        if not self._sent.has_room(self.peer, self.rollout_bytes, self.released_messages):
+        """See `PipeWriter`; None, too, while the block has no space for a rollout."""
+        if not self._sent.has_space(self.peer, self.rollout_bytes, self.released_messages):
             return None
         return super().try_reserve(sizes)
 
@@ -67,7 +67,7 @@ class ResidentPacker:
         self._num_envs = 0
 
     def try_add(self, piece: Rollouts) -> bool:
-        """Copies a rollout into the block, if there is room; its arrays are jax's.
+        """Copies a rollout into the block, if there is space; its arrays are jax's.
 
         Raises:
           ConfigError: too little memory for two rollouts, or one of another size.

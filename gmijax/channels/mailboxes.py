@@ -46,17 +46,17 @@ def frames_of(
     parts = [np.frombuffer(skeleton, np.uint8), *map(as_bytes, arrays)]
     head = np.array([tag, len(parts), *(part.size for part in parts)], np.uint64)
     frames: list[Frame] = [[]]
-    room = frame_bytes
+    free_bytes = frame_bytes
     for part in (head.view(np.uint8), *parts):
         start = 0
         while start < part.size:
-            if not room or len(frames[-1]) == MAX_PARTS:
+            if not free_bytes or len(frames[-1]) == MAX_PARTS:
                 frames.append([])
-                room = frame_bytes
-            piece = part[start : start + room]
+                free_bytes = frame_bytes
+            piece = part[start : start + free_bytes]
             frames[-1].append(piece)
             start += piece.size
-            room -= piece.size
+            free_bytes -= piece.size
     return frames
 
 
@@ -91,7 +91,7 @@ class Outbox:
             # A frame that the thread is busy with is still among those that wait.
             while left and not self._frames and self._writer.try_put(left[0]):
                 left.popleft()
-            if left and not self._wait_for(self._has_room, timeout_s):
+            if left and not self._wait_for(self._has_space, timeout_s):
                 peers = (self._writer.peer,)
                 raise CollectiveTimeout(self._rank, peers, "send", self._posts, timeout_s)
             self._raise_error()
@@ -115,7 +115,7 @@ class Outbox:
         """Waits for a change that makes it so; whether it came in time."""
         return wait_for(lambda seconds: self._changed.wait_for(is_so, seconds), timeout_s)
 
-    def _has_room(self) -> bool:
+    def _has_space(self) -> bool:
         return self._waiting_bytes < MAX_WAITING_BYTES or self._error is not None
 
     def _raise_error(self) -> None:
@@ -167,26 +167,26 @@ class Inbox:
         for part in frame:
             data = part
             while data.size:
-                count = min(self._room.size, data.size)
-                self._room[:count] = data[:count]
-                self._room, data = self._room[count:], data[count:]
+                count = min(self._unfilled.size, data.size)
+                self._unfilled[:count] = data[:count]
+                self._unfilled, data = self._unfilled[count:], data[count:]
                 self._advance()
 
     def _begin(self) -> None:
-        self._rooms = self._fill_messages()
-        self._room = next(self._rooms)
+        self._buffers = self._fill_messages()
+        self._unfilled = next(self._buffers)
 
     def _advance(self) -> None:
-        """Goes on to the next room that is not full."""
+        """Moves to the next buffer that is not full."""
         try:
-            while not self._room.size:
-                self._room = next(self._rooms)
+            while not self._unfilled.size:
+                self._unfilled = next(self._buffers)
         except BaseException:  # Of a message that cannot be unpickled: the next one may be.
             self._begin()
             raise
 
     def _fill_messages(self) -> Iterator[Bytes]:
-        """Gives out memory for what comes next, and takes it for filled when asked again."""
+        """Yields the next buffer to fill; it counts as filled when the next one is requested."""
         while True:
             yield (head := np.empty(_HEAD.size, np.uint8))
             tag, num_parts = _HEAD.unpack(head.data)

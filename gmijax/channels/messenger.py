@@ -81,7 +81,7 @@ class Messenger:
         """
         self._check(src, "src")
         inbox = self._inbox(src)
-        # Nobody else sends to oneself.
+        # No other rank sends to this one's own queue.
         allowed_s = self._timeout_s if timeout_s is None else timeout_s
         allowed_s = 0.0 if src == self.rank else allowed_s
         arrived = wait_until(
@@ -106,7 +106,7 @@ class Messenger:
 
         Raises:
           PeerLost: a receiver is gone, and has not taken all.
-          CollectiveTimeout: receivers have not made room in time; names them.
+          CollectiveTimeout: receivers have not freed space in time; names them.
         """
         deadline_s = running_s() + self._timeout_s
         late = [
@@ -149,7 +149,7 @@ class Messenger:
             if (frame := reader.try_get()) is None:
                 return False
             self._inbox(src).feed(frame)
-            # What stayed on the GPU is copied by now: its place is free with the frame.
+            # What stayed on the GPU is copied by now: its memory is free with the frame.
             reader.release()
         return True
 

@@ -31,7 +31,7 @@ class Migrator(Generic[W]):
         self._next_look_s = time.monotonic()
 
     def try_open(self, sizes: Sequence[int]) -> tuple[W, list[Bytes]] | None:
-        """A way for a transfer with parts of `sizes` bytes and its memory; None: no room now.
+        """A writer for a transfer with parts of `sizes` bytes, and its memory; None: it is full.
 
         Raises:
           PipeClosed: a trainer has closed its end.
@@ -72,7 +72,7 @@ class Migrator(Generic[W]):
         return min(writer.occupancy() for writer in self._candidates)
 
     def close(self) -> None:
-        """Tells all trainers that nothing more comes."""
+        """Marks the end of the transfers for all trainers."""
         for writer in self.writers:
             writer.close()
 

@@ -50,7 +50,7 @@ Message: TypeAlias = tuple[Bytes, ...]
 class PipeWriter:
     """The writing end of the pipe from `block.rank` to `peer`.
 
-    A message may take half of the ring (`max_message_bytes`): then there is room for it, at
+    A message may take half of the ring (`max_message_bytes`): then there is space for it, at
     the latest, when the reader has released all before it. `messages` counts those committed.
 
     Raises:
@@ -95,11 +95,11 @@ class PipeWriter:
         return self._block.why_lost(self.peer, operation, step)
 
     def put(self, parts: Sequence[npt.NDArray[Any]], timeout_s: float) -> None:
-        """Writes one message made of arrays of whatever strides, when there is room.
+        """Writes one message made of arrays with any strides, when there is space.
 
         Raises:
-          CollectiveTimeout: there was no room in time.
-          PeerLost: the reader's process is gone, and there is no room.
+          CollectiveTimeout: there was no space in time.
+          PeerLost: the reader's process is gone, and there is no space.
           PipeClosed, CollectiveError: see `try_reserve`.
         """
         is_put = wait_until(
@@ -112,7 +112,7 @@ class PipeWriter:
             raise CollectiveTimeout(rank, (self.peer,), "put", step, timeout_s)
 
     def try_put(self, parts: Sequence[npt.NDArray[Any]]) -> bool:
-        """As `put`, but without waiting: whether there was room."""
+        """As `put`, but without waiting: whether there was space."""
         if (views := self.try_reserve([part.nbytes for part in parts])) is None:
             return False
         for view, part in zip(views, parts, strict=True):
@@ -161,7 +161,7 @@ class PipeWriter:
         self._own["position"][0] = self._position
 
     def close(self) -> None:
-        """Tells the reader that nothing more comes. Idempotent."""
+        """Marks the end of the messages for the reader. Idempotent."""
         self._fence()
         self._own["closed"][0] = 1
 
@@ -235,7 +235,7 @@ class PipeReader:
             self._own["position"][0] = self._position
 
     def close(self) -> None:
-        """Tells the writer that nothing more is wanted. Idempotent."""
+        """Makes the writer stop: nothing more is read. Idempotent."""
         self.release()
         self._own["closed"][0] = 1
 

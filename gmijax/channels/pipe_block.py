@@ -34,7 +34,7 @@ LINE = np.dtype(
     [
         ("pid", np.uint64),  # 0 until the rank has come
         ("start_ticks", np.uint64),
-        ("has_left", np.uint64),  # by itself: nobody calls it lost
+        ("has_left", np.uint64),  # by itself: no rank reports it as lost
         ("pad", np.uint64, (5,)),
     ]
 )
@@ -136,7 +136,7 @@ class PipeBlock:
             ) from None
 
     def close(self) -> None:
-        """Leaves: nobody will call this rank lost. Idempotent."""
+        """Leaves: no rank will report this one as lost. Idempotent."""
         if self._mapping is not None:
             fence()
             self._lines["has_left"][self.rank] = 1

@@ -7,9 +7,9 @@
 | next multiple of 64 | the parts, each from a multiple of 64 on, so that arrays are aligned |
 
 A message is contiguous. What is left at the end of the ring and too short is a gap: a header of
-its own kind that only says how long it is. The sum of all 64-bit words of a message, modulo 2^64,
-is 0, and so is that of a gap's header. That finds what another message left behind, whole or in
-part; not words that changed places. It runs at the speed of memory, where a CRC takes ten times as
+its own kind that holds only its length. The sum of all 64-bit words of a message, modulo 2^64,
+is 0, and so is that of a gap's header. That detects what another message left behind, whole or in
+part; not words that were swapped. It runs at the speed of memory, where a CRC takes ten times as
 long as the copy itself.
 """
 
@@ -30,7 +30,7 @@ ALIGNMENT = 64
 MESSAGE, GAP = 0x4D494D47, 0x47494D47  # "GMIM" and "GMIG" in memory on a little-endian machine
 
 _HEADER = struct.Struct("=5Q")
-_CHECKSUM = 4  # Place in the header.
+_CHECKSUM = 4  # Index in the header.
 
 
 class Header(NamedTuple):
@@ -44,7 +44,7 @@ class Header(NamedTuple):
 
 
 class Damaged(Exception):
-    """What stands in the ring is no message; the text says what is wrong."""
+    """The content of the ring is no message; the text is what is wrong."""
 
 
 def message_bytes(sizes: Sequence[int]) -> int:
@@ -67,7 +67,7 @@ def seal_gap(ring: Bytes, begin: int, length: int, sequence: int) -> None:
 
 
 def seal_message(ring: Bytes, begin: int, sizes: Sequence[int], sequence: int) -> None:
-    """Writes header and sizes of a message whose parts are in place."""
+    """Writes header and sizes of a message whose parts are written."""
     length = message_bytes(sizes)
     ring[begin + ALIGNMENT : begin + ALIGNMENT + 8 * len(sizes)].view(np.uint64)[:] = sizes
     _seal(ring, begin, Header(MESSAGE, len(sizes), sequence, length), length)

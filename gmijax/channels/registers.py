@@ -1,4 +1,4 @@
-"""Registers in shared memory: one writer each, any number of readers, nobody ever waits.
+"""Registers in shared memory: one writer each, any number of readers, no waiting.
 
 A register holds the newest value only. It is a seqlock with two buffers, written in turn: a reader
 that copies one is disturbed only if the writer begins to publish for the second time meanwhile,
@@ -12,13 +12,13 @@ which a counter shows. The order of memory accesses is kept by `Fence`.
 Wire format (native byte order): a line of 64 bytes (`LINE`) for every register, then for every
 register two buffers of its size, each on pages of its own.
 
-Between nodes the newest values travel by TCP (`RemoteRegisters`), and nobody waits either.
+Between nodes the newest values travel by TCP (`RemoteRegisters`), without waiting either.
 
     mine = RemoteRegisters(0, {7: address}, [64, 4096], [16], listens=False, secret=secret)
     mine.own(1).publish(array, tag=7)                   # to all of `addresses`
     mine.of(7, 0).read(after=0)                         # None if nothing is newer
 
-Whoever publishes sends the newest values of all its registers in one message. Of the messages
+A publish sends the newest values of all registers of the writer in one message. Of the messages
 that wait, at either end, the last one alone is kept: a reader that comes seldom gets what is
 newest, and takes no memory meanwhile. Wire format: for every register of the sender `_HEAD`, then
 their bytes.
@@ -54,7 +54,7 @@ _LOOKS = 3
 class Snapshot(NamedTuple):
     """The newest value of a register: a copy of its bytes, [length] uint8, and the writer's tag.
 
-    `count` says how often the register had been published; give it to the next `read`.
+    `count` is how often the register had been published; give it to the next `read`.
     """
 
     count: int
@@ -88,7 +88,7 @@ class Register:
         count = int(self._line["count"][0]) + 1
         buffer = count % 2
         self._line["begun"][0] = count
-        self._fence()  # Who sees anything of what follows sees that it was begun.
+        self._fence()  # A reader of anything that follows sees that it was begun.
         self._buffers[buffer, : data.size] = data
         self._line["tag"][0, buffer] = tag
         self._line["length"][0, buffer] = data.size
@@ -132,10 +132,10 @@ def open_registers(fd: int, sizes_bytes: Sequence[int]) -> list[Register]:
     mapping = map_file(fd, offset + 2 * sum(sizes), "registers")
     lines = np.frombuffer(mapping, LINE, len(sizes))
     registers = []
-    for index, (size, room) in enumerate(zip(sizes_bytes, sizes, strict=True)):
-        buffers = np.frombuffer(mapping, np.uint8, 2 * room, offset).reshape(2, room)
+    for index, (size, padded) in enumerate(zip(sizes_bytes, sizes, strict=True)):
+        buffers = np.frombuffer(mapping, np.uint8, 2 * padded, offset).reshape(2, padded)
         registers.append(Register(lines[index : index + 1], buffers[:, :size]))
-        offset += 2 * room
+        offset += 2 * padded
     return registers
 
 
@@ -224,7 +224,7 @@ class RemoteRegisters:
                     found.append(Snapshot(count, tag, data[begin : begin + length]))
                     begin += length
         if len(found) < len(self._their_bytes) or begin != data.size:
-            # Only who has the secret could send it.
+            # Authenticated: only a GMI of this job has the secret.
             raise CollectiveError(f"GMI {self._rank}: no message of registers from GMI {peer}")
         return found
 

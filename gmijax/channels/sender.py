@@ -1,4 +1,4 @@
-"""An agent's end of the channels: the dispenser, and back-pressure, which waits for room."""
+"""An agent's end of the channels: the dispenser, and back-pressure, which waits for space."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from gmijax.collectives.waits import wait_until
 from gmijax.errors import ConfigError, GmijaxError
 
 CLOSE_TIMEOUT_S = 5.0
-"""How long an agent that closes waits for room for what it has not sent yet."""
+"""How long an agent that closes waits for space for what it has not sent yet."""
 
 
 class MessageEncoder(Protocol):
     """What makes messages of pieces: a `Compressor`, a `UniPacker` or a `ResidentPacker`."""
 
     def try_add(self, piece: Rollouts) -> bool:
-        """Takes `piece`, or says that there is no room; then the same piece must come again."""
+        """Takes `piece`; False: there is no space, and the same piece must be passed again."""
         ...
 
     def flush(self) -> None:
@@ -84,7 +84,7 @@ class Sender:
     Attributes:
       on_device: whether it takes arrays of the device; otherwise numpy's.
       num_bytes: sent, in all channels.
-      waited_s: time spent waiting for room.
+      waited_s: time spent waiting for space.
     """
 
     dispenser: Dispenser
@@ -106,10 +106,10 @@ class Sender:
           experience: arrays by channel, as a mapping or a NamedTuple; names, S, dtypes and what
             follows N stay the same.
           version: of the policy that acted.
-          timeout_s: longest wait for room.
+          timeout_s: longest wait for space.
 
         Returns:
-          False if no trainer made room in time. Then, and after an error, call it again with the
+          False if no trainer freed space in time. Then, and after an error, call it again with the
           same experience until it is done: a part may have been sent.
 
         Raises:

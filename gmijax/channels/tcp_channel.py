@@ -39,7 +39,7 @@ class _Received(NamedTuple):
 
 
 class _End:
-    """What both ends of a way have: a connection, and whether the peer has said goodbye."""
+    """What both ends of a channel have: a connection, and whether the peer has closed its end."""
 
     def __init__(self, connection: Connection) -> None:
         self.peer = connection.peer
@@ -49,7 +49,7 @@ class _End:
         self._has_left = False
 
     def _send_notice(self, kind: int, sequence: int) -> None:
-        """Sends a message without parts, if there is somebody who could want it."""
+        """Sends a message without parts, if a peer is there that could need it."""
         self._connection.send([HEADER.pack(kind, sequence)])
 
     def _why_ended(self, operation: str, step: int) -> GmijaxError | None:
@@ -66,7 +66,7 @@ class _End:
         head = found[0].tobytes() if found else b""
         kind, sequence = HEADER.unpack(head) if len(head) == HEADER.size else (0, 0)
         if kind not in (DATA, GOODBYE, RELEASED):
-            # Only who has the secret could send it.
+            # Authenticated: only a GMI of this job has the secret.
             raise CollectiveError(
                 f"GMI {self._rank}: no message of a channel from GMI {self.peer}"
             )

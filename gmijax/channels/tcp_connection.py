@@ -1,8 +1,8 @@
 """One end of a TCP connection between two processes of a job, with a thread that moves the bytes.
 
-One end listens, for this one peer and until it has come; the other calls until it is heard. Both
-prove that they know the job's secret (`gmijax/collectives/nodes/handshake.py`). A connection that
-has ended does not come back.
+One end listens, for this one peer and until it has connected; the other end tries until it has.
+Both prove that they know the job's secret (`gmijax/collectives/nodes/handshake.py`). A connection
+that has ended is not made again.
 """
 
 from __future__ import annotations
@@ -40,11 +40,10 @@ class Connection:
       address: `host:port`, at which one of the two listens.
       rank: of this process, for messages.
       peer: that of the other one.
-      max_message_bytes: who sends a longer one is cut off.
+      max_message_bytes: a peer that sends a longer one is disconnected.
       listens: whether this is the end that listens.
       secret: of the job.
-      newest_only: of messages that wait, at either end, the last one takes the place of all
-        others.
+      newest_only: of messages that wait, at either end, only the last one is kept.
 
     Raises:
       CollectiveError: an address that cannot be.
@@ -127,7 +126,7 @@ class Connection:
 
     def _run(self) -> None:
         try:
-            connection = self._heard() if self._listener else self._called()
+            connection = self._accept() if self._listener else self._connect()
             if connection is not None:
                 with connection:
                     self._was_up = True
@@ -144,8 +143,8 @@ class Connection:
     def _time_left(self) -> float:
         return 0.0 if self.is_closed else math.inf
 
-    def _heard(self) -> socket.socket | None:
-        """The connection of the peer, after which nobody listens; None if it did not come."""
+    def _accept(self) -> socket.socket | None:
+        """The connection of the peer, with the listener closed; None if it did not connect."""
         assert self._listener is not None
         with self._listener, closing(accepted(self._listener, self._key, self._time_left)) as all_:
             for connection, caller in all_:
@@ -154,7 +153,7 @@ class Connection:
                 connection.close()
         return None
 
-    def _called(self) -> socket.socket | None:
+    def _connect(self) -> socket.socket | None:
         """The connection with the peer, once it listens; None if it did not before the end."""
         while not self.is_closed:
             with suppress(OSError):
@@ -188,7 +187,7 @@ class Connection:
             while outgoing.send(connection):
                 if not self._outgoing:
                     return True
-                while self._outgoing and outgoing.has_room:
+                while self._outgoing and outgoing.has_space:
                     outgoing.add(self._outgoing.popleft())
         except ConnectionError:
             return True  # The other end takes nothing more, but may have sent something before.
@@ -208,7 +207,7 @@ class Connection:
 
 
 def _listening(address: tuple[str, int]) -> socket.socket:
-    """A listening socket, which may share its port with who reserved it."""
+    """A listening socket, which may share its port with the process that reserved it."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)

@@ -30,7 +30,7 @@ class Outgoing:
         self._views: deque[memoryview] = deque()
 
     @property
-    def has_room(self) -> bool:
+    def has_space(self) -> bool:
         """Whether another message would be sent with those that are here."""
         return len(self._views) < _VIEWS_AT_ONCE
 
@@ -64,7 +64,7 @@ def messages(
 
     Args:
       connection: with the other end.
-      max_bytes: longest message; what has more parts than that has room for lengths is too long.
+      max_bytes: longest message; one with more parts than so many bytes hold lengths is too long.
 
     Raises:
       OSError: the connection has ended.

@@ -31,8 +31,8 @@ def flatten(
     Args:
       tree: nested data with arrays of numpy or jax; those of jax are copied to host memory.
       scalars: count Python floats and scalars of numpy among the arrays.
-      put: asked first for every object; what it returns, if not None, travels in its place, and
-        `unflatten` hands it to its `get`.
+      put: called first for every object; what it returns, if not None, is sent instead, and
+        `unflatten` passes it to its `get`.
 
     Returns:
       The skeleton and the arrays, C-contiguous, perhaps views of what was flattened.
@@ -68,7 +68,7 @@ def as_bytes(array: npt.NDArray[Any]) -> Bytes:
 def on_host(value: Any) -> npt.NDArray[Any] | None:
     """The numbers of an array of numpy or jax in host memory; None for anything else.
 
-    The one place where arrays leave a device on their way to another GMI, if they do.
+    The only function in which arrays leave a device on their way to another GMI.
     """
     if type(value) is np.ndarray:  # Masked arrays and the like are more than their numbers.
         return value

@@ -18,7 +18,7 @@ from gmijax.channels.pipe import Message
 
 
 class UniPacker:
-    """Takes the place of the compressor; a `MessageEncoder`."""
+    """Replaces the compressor; a `MessageEncoder`."""
 
     def __init__(self, migrator: Migrator) -> None:
         self._migrator = migrator
@@ -26,7 +26,7 @@ class UniPacker:
         self._todo: list[tuple[int, int]] = []
 
     def try_add(self, piece: Rollouts) -> bool:
-        """Sends what there is room for; False: call it again with the same piece."""
+        """Sends what fits now; False: call it again with the same piece."""
         if not self._todo:
             self._writer = None
             self._todo = _tensors(piece.spec)

@@ -33,7 +33,7 @@ _MOST_RUNS: Final = 30
 
 
 def own_answers(command: str, words: Sequence[str]) -> list[str] | None:
-    """What the last of the words may become; None: what Hydra says.
+    """What the last of the words may become; None: Hydra's answer.
 
     Args:
       command: one with keys.

@@ -48,7 +48,7 @@ def _with_custom_task(name: str, override: str) -> tuple[str, ...]:
         is_shipped = name in ("play", "view") and override.startswith("env=")
         return (f"run.{override}" if is_shipped else override,)
     value = override.removeprefix("env=") if match[1] else quoted(match[2])
-    if name in ("play", "export", "view"):  # Which task it is the run says.
+    if name in ("play", "export", "view"):  # The task is that of the run.
         return (f"run.env={value}",)
     return "env=custom", f"env.name={value}"
 

@@ -74,7 +74,7 @@ def compose(*overrides: str, command: str = "train", env: Callable[..., Any] | N
       command: `train`, `search` (a training job whose `num_envs` and `plan.gmis_per_gpu` are
         `auto`) or `serve`.
       env: a function `make(*, impl, max_envs) -> gmijax.sim.interface.Env` at the top level of a
-        file, in place of `env=path/to/file.py:make`.
+        file, instead of `env=path/to/file.py:make`.
 
     Examples:
       >>> compose("env=ant", "num_envs=512").num_envs
@@ -125,7 +125,7 @@ def _require_steps(config: object) -> None:
 
 
 def _names_policy(items: Sequence[Override]) -> bool:
-    """Whether a command line of `serve` says which run's policy acts, or that none does."""
+    """Whether a command line of `serve` sets which run's policy acts, or that none does."""
     return any(
         item.key_or_group == "run.dir"
         or (item.key_or_group == "policy" and item.value() != "trained")
@@ -289,7 +289,7 @@ def _has_group(group: str, known: Collection[str]) -> bool:
 def _on_top_of_saved(
     data: dict[str, Any], items: Sequence[Override], resume: str
 ) -> dict[str, Any]:
-    """The saved configuration of the resumed run, changed where the command line says so.
+    """The saved configuration of the resumed run, with the changes of the command line.
 
     What an older version did not save comes from the defaults for the run's own task.
     """
@@ -304,7 +304,7 @@ def _on_top_of_saved(
         if key == "env.name":  # Whatever the file holds by now is meant.
             merged["env"]["source_sha256"] = None
         if (key, item.value()) == ("env", "custom") and suite == "custom":
-            continue  # The file may have moved; `env.name` says where to.
+            continue  # The file may have moved; `env.name` has the new path.
         if copy_key(key, data, merged):
             continue
         if item.is_delete() or choices(key):
@@ -318,7 +318,7 @@ def _on_top_of_saved(
 
 
 def _with_task_of_run(data: dict[str, Any], items: Sequence[Override]) -> dict[str, Any]:
-    """With `run.dir` and without `env=`: the task of that run, changed where `env.*` says so."""
+    """With `run.dir` and without `env=`: the task of that run, with the changes of `env.*`."""
     run_dir = data["run"].get("dir") if isinstance(data["run"], dict) else None
     if run_dir is None or any(item.key_or_group == "env" for item in items):
         return data

@@ -20,7 +20,7 @@ MANY: Final = 60
 """A command with more keys shows the usual ones unless a topic is named."""
 
 _DEFAULT_WIDTH: Final = 16
-"""Of a column that must leave room for meanings in 80 columns."""
+"""Of a column that must leave space for meanings in 80 columns."""
 
 USUAL: Final = (
     *("num_envs", "num_timesteps", "seed", "unroll_length", "policy"),
@@ -179,7 +179,7 @@ def _shown_default(key: str, values: Mapping[str, Any]) -> str:
         if isinstance(value, bool):
             return str(value).lower()
         return "null" if value is None else str(value)
-    # A group whose keys are the user's to choose: their names say more than all their values.
+    # A group whose keys are the user's to choose: their names help more than all values.
     names = {name.removeprefix(f"{key}.").split(".")[0] for name in values if f"{key}." in name}
     return ", ".join(sorted(names)) or "{}"
 
@@ -187,7 +187,7 @@ def _shown_default(key: str, values: Mapping[str, Any]) -> str:
 def _documented(
     cls: type[Any], prefix: str = "", choice: str = ""
 ) -> Iterator[tuple[str, str, Any, Mapping[str, Any]]]:
-    """Every key: the choice that it belongs to, name, type, what `doc` says of it."""
+    """Every key: the choice that it belongs to, name, type, its text in `doc`."""
     hints = typing.get_type_hints(cls)
     # Own keys first, then those that it shares with other dataclasses.
     for field in sorted(dataclasses.fields(cls), key=lambda x: x.name not in cls.__annotations__):

@@ -21,10 +21,10 @@ _OF_THE_COMMAND: Final = (
     *("run.dir", "run.name", "run.resume", "run.profile"),
     *("env.suite", "env.name", "env.source_sha256", "algo.name"),
 )
-"""Keys that are not taken from a run: where it goes on, and of which task and algorithm it is."""
+"""Keys that are not taken from a run: where it continues, and its task and algorithm."""
 
 _OF_THE_MACHINE: Final = ("plan", "cluster", "search")
-"""Groups that say where a job runs, which may be elsewhere each time."""
+"""Groups that set where a job runs, which may be elsewhere each time."""
 
 
 def as_the_run_was(
@@ -32,7 +32,7 @@ def as_the_run_was(
 ) -> dict[str, Any]:
     """The configuration of a command with `run.resume=auto`, as of the run in its folder.
 
-    What the command says, by itself or by a file that it chooses, is as it says. All else is as
+    What the command sets, by itself or by a file that it chooses, is as set there. All else is as
     the run has it, so that another version with other defaults does not train it otherwise.
 
     Args:

@@ -26,7 +26,7 @@ _POLL_S = 0.2
 
 
 def by_name(joined: Sequence[NodeHandle]) -> dict[str, NodeHandle]:
-    """Nodes by address, in order; those after the first of a machine have their place added."""
+    """Nodes by address, in order; those after the first of a machine have their number added."""
     named: dict[str, NodeHandle] = {}
     for number, node in enumerate(joined):
         address = node.remote.address

@@ -70,7 +70,7 @@ class ClusterJob:
         """Finds nodes for another attempt: so many, or fewer once the wait is over.
 
         Raises:
-          ConfigError: as `join`; fewer nodes, and the job may not go on with them.
+          ConfigError: as `join`; fewer nodes, and the job may not continue with them.
           JobInterrupted: a signal came.
         """
         least, signals = 1 if elastic else num_nodes, self._signals
@@ -161,7 +161,7 @@ def _cpus_of_a_node(config: TrainConfig) -> int:
     assert wanted != "auto"
     most = most_gmis_of_a_node(config.plan, wanted)
     for fewer in range(1, wanted if config.run.elastic else 1):
-        with suppress(ConfigError):  # Then the job will not go on with so few.
+        with suppress(ConfigError):  # Then the job will not continue with so few.
             left = on_fewer_nodes(config.plan, wanted, fewer)
             most = max(most, most_gmis_of_a_node(left, fewer))
     return most

@@ -112,7 +112,7 @@ class Node:
     def __init__(
         self, variables: Mapping[str, str], folder: str, interface: str | None, address: str
     ) -> None:
-        # Ray sets one thread for who has said nothing; GMIs get what fits their cores.
+        # Ray sets one thread unless the user has set a number; GMIs get what fits their cores.
         os.environ.pop("OMP_NUM_THREADS", None)
         os.environ.update(variables)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
@@ -168,7 +168,7 @@ class TrainingNode(Node):
     def open(
         self, launch: Launch, node: int, address: str, daemons: Mapping[str, Path]
     ) -> NodeEndpoints | BackendUnavailable:
-        """Makes what the GMIs share, or says why this machine cannot; may be called again.
+        """Makes what the GMIs share, or reports why this machine cannot; may be called again.
 
         Args:
           launch: what to run.
@@ -192,7 +192,7 @@ class TrainingNode(Node):
         self._held.callback(_remove_if_empty, own.root)
         self._blocks = shared_blocks(self._held, launch.kind, launch.plan)
         machine, layout = detect_machine(), launch.plan.layout
-        # Who starts a second daemon for a GPU has its clients take turns with those of the first.
+        # Clients of a second daemon for a GPU would take turns with those of the first.
         machine = dataclasses.replace(machine, daemons={**daemons, **machine.daemons})
         backend = open_backend(launch.plan, machine, own, layout.gmis_of_node[node])
         self._backend = self._held.enter_context(backend)
@@ -257,7 +257,7 @@ class TrainingNode(Node):
         }
 
     def order(self, gmi: int, order: Order) -> None:
-        """Does what the controller says with a GMI."""
+        """Does what the controller requests with a GMI."""
         getattr(self._started[gmi], order)()
 
     def request_stacks(self, gmi: int) -> int | None:

@@ -88,7 +88,7 @@ class RayCluster:
           most_gpus: of each; None: all.
 
         Raises:
-          ConfigError: there are fewer nodes, they have no room, or one cannot take part.
+          ConfigError: there are fewer nodes, they are not free, or one cannot take part.
           JobInterrupted: it is unwanted.
         """
         self.leave()
@@ -166,7 +166,7 @@ class RayCluster:
         options: dict[str, Any] = {"include_dashboard": False} if address == "local" else {}
         before = signal.getsignal(signal.SIGTERM)
         try:
-            # What Ray has to say of an error is in what it raises.
+            # Ray's report of an error is in what it raises.
             options |= {"log_to_driver": False, "logging_level": "CRITICAL"}
             self._ray.init(address=address, **options)
         except Exception as error:
@@ -197,13 +197,13 @@ class RayCluster:
     def _place(self, bundle: dict[str, float], num_nodes: int, deadline_s: float) -> None:
         ray = self._ray
         self._group = ray.util.placement_group([bundle] * num_nodes, strategy="STRICT_SPREAD")
-        # Ray needs a moment also where there is room.
+        # Ray needs a moment also where nodes are free.
         if not self._group.wait(max(_PLACE_S, deadline_s - running_s())):
             self.leave()
-            room = ", ".join(f"{count} {name}s" for name, count in bundle.items())
+            resources = ", ".join(f"{count} {name}s" for name, count in bundle.items())
             raise ConfigError(
-                f"cluster.nodes={self._config.nodes}: no {num_nodes} nodes with {room} free each "
-                f"within cluster.wait_s={self._config.wait_s:g} s"
+                f"cluster.nodes={self._config.nodes}: no {num_nodes} nodes with {resources} free "
+                f"each within cluster.wait_s={self._config.wait_s:g} s"
             )
         variables = {k: v for k, v in os.environ.items() if k.startswith(PASSED_ON)}
         arguments = (self._kind, variables, os.getcwd(), self._config.interface)
@@ -282,7 +282,7 @@ class _NodeActor:
 
 @contextmanager
 def _for_this_job_alone() -> Iterator[None]:
-    """Variables by which Ray starts a cluster that nobody but its own processes gets into.
+    """Variables by which Ray starts a cluster that only its own processes can join.
 
     It takes no connection but of this machine, and asks for a token that is in no file. Ray reads
     them when it is imported.

@@ -143,7 +143,7 @@ class RemoteGmi(WatchedGmi):
         seen: RemoteGmiStatus | None = self._node.look(self.gmi)
         self.is_silent = self._node.is_silent
         if seen is not None:
-            self._heard(seen.beats, seen.beat)
+            self._record_heartbeat(seen.beats, seen.beat)
             self._error, self._log_bytes = seen.error, seen.log_bytes
             self.exit_code = seen.exit_code
         if self.exit_code is None and self._node.lost is not None:

@@ -34,7 +34,7 @@ class NodeInfo(NamedTuple):
 
 
 class SurveyedNode(Node):
-    """A node that is only looked at: it sees all GPUs, whoever uses them."""
+    """A node that is only looked at: it sees all GPUs, also those in use."""
 
     def facts(self, version: str) -> Facts | str:
         """See `Node`."""
@@ -61,7 +61,7 @@ def survey(address: str) -> dict[str, NodeInfo]:
         return _survey(address)
     except ConfigError as error:
         text = str(error)
-        for key in ("cluster.engine=ray", f"cluster.address={address}"):  # Nobody typed them.
+        for key in ("cluster.engine=ray", f"cluster.address={address}"):  # Not typed.
             text = text.replace(f"{key}: ", f"cluster={address}: ", 1)
         raise ConfigError(text) from None
 

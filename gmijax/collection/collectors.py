@@ -30,7 +30,7 @@ class CollectorContext(NamedTuple):
     """One GMI's part of a serving job.
 
     Attributes:
-      rank: place among the GMIs that simulate (an agent: among the agents).
+      rank: among the GMIs that simulate (an agent: among the agents).
       first_unroll: unrolls that earlier jobs have written of this GMI's part.
       num_unrolls: unrolls that are left to be made.
       writer: takes the experience, None where it is not kept.
@@ -55,7 +55,7 @@ class CollectorContext(NamedTuple):
         """Environments at their starts.
 
         Starts depend on the seed, on the number of the environment in the whole job, and on how
-        many unrolls were there before: a job that goes on makes other episodes, not the same.
+        many unrolls were there before: a continued job makes other episodes, not the same.
         """
         key = jax.random.fold_in(jax.random.key(self.config.seed), self.first_unroll)
         num_envs = self.config.envs_per_gmi

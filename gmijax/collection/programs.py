@@ -1,4 +1,4 @@
-"""Who acts while experience is collected, and the compiled part: an unroll of T steps."""
+"""The policy that acts while experience is collected, and the compiled unroll of T steps."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ class ShardWriter:
         content = io.BytesIO()
         save: Callable[..., None] = np.savez  # For pyright, an array may be called `allow_pickle`.
         save(content, **arrays)
-        # On the disk before its JSON file is, which says that the shard is there.
+        # On the disk before its JSON file, which marks the shard as complete.
         write_bytes(shard.arrays, content.getvalue())
         write_json(
             shard.about,
@@ -77,7 +77,7 @@ class ShardWriter:
                 **self._about,
                 "shard": index,
                 "env_steps": int(arrays["reward"].size),
-                # The environments of a job that goes on start anew; no episode spans the gap.
+                # The environments of a continued job start anew; no episode spans the gap.
                 "starts_with_reset": index == self._first,
                 "num_bytes": content.tell(),
                 "arrays": {

@@ -1,4 +1,4 @@
-"""Steps of the start that all ranks of a job do together, or none goes on."""
+"""Steps of the start that succeed on all ranks of a job, or fail on all of them."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ Group: TypeAlias = SharedMemoryGroup | MultiNodeGroup
 """The ranks of a job, on one node or several."""
 
 NOTE_BYTES = 240
-"""What a rank hands to the others at each step: what the step returned, or why it failed."""
+"""Bytes that a rank sends to the others at each step: its result, or the reason of its failure."""
 
 
 def all_or_none(group: Group, what: str, step: Callable[[], bytes]) -> npt.NDArray[np.uint8]:
     """Does a step of the start; returns what it returned on all ranks.
 
-    Collective: all ranks of the job call it, and they go on together or not at all.
+    Collective: all ranks of the job call it; it returns on all of them or on none.
 
     Args:
       group: this rank's use of the shared block.
-      what: what cannot be had if the step fails, for the message.
+      what: what is unavailable if the step fails, for the message.
       step: returns at most NOTE_BYTES.
 
     Returns:
@@ -57,7 +57,7 @@ def all_or_none(group: Group, what: str, step: Callable[[], bytes]) -> npt.NDArr
 def warn_of(what: str, error: Exception) -> str:
     """Warns of what failed on this rank, at once; the error in words.
 
-    The others may never hear of it: they may wait in NCCL, which has no limit of time.
+    The error may never reach the others: they may wait in NCCL, which has no time limit.
     """
     message = " ".join(str(error).split()) or type(error).__name__
     # Of this line, so that Python shows it once, although it is an answer of a later step too.

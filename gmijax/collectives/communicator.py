@@ -28,7 +28,7 @@ from gmijax.partition.reduction import require_strategy, why_no_bindings
 _Lane: TypeAlias = SharedMemoryGroup | MultiNodeGroup
 
 GATHERED_FLOATS = 1024
-"""Of each rank; more where P leaves room for them."""
+"""Of each rank; more if P is larger than what all ranks need for these."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +198,7 @@ def _lanes(config: CommunicatorConfig) -> Sequence[_Lane]:
 def _over_nodes(
     config: CommunicatorConfig, lanes: Sequence[SharedMemoryGroup], leader: int
 ) -> Sequence[MultiNodeGroup]:
-    """The lanes with what goes on between nodes; leaders wait here for each other."""
+    """The lanes, connected between nodes; leaders wait here for each other."""
     layout, rank = config.layout, config.rank
     nodes, listener = config.nodes, config.listener
     if nodes is None or listener is None:
@@ -231,7 +231,7 @@ def _ids(config: CommunicatorConfig) -> Sequence[int]:
 
 
 def _capacity(config: CommunicatorConfig) -> int:
-    """Length of the largest buffer whose sum is taken; what is gathered is one of all ranks."""
+    """Length of the largest buffer that is summed; a gather sums one buffer of all ranks."""
     return max(config.num_floats, GATHERED_FLOATS * config.layout.num_gmis)
 
 

@@ -32,17 +32,17 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _FREE = 2**30
-_WISH = "exchange on the device's stream"
+_FEATURE = "exchange on the device's stream"
 
 
 class DesyncDetector:
     """Detects ranks that call different collectives, or in another order, without waiting.
 
-    Flags only count. Each rank keeps a word beside its own: how many exchanges it has come to,
-    and a checksum of which ones these were, in their order. It looks at the words of those that
-    have come as far. Checksums that differ once go on to do so, and who comes last to the end of
-    a step finds all others there: so one of two ranks sees it before the next step, whoever is
-    ahead.
+    Flags only count. Beside its flag each rank keeps the number of exchanges that it has reached,
+    and a checksum of which ones these were, in their order. It compares the checksums of ranks
+    with the same number. Checksums never agree again once they differ, and the last rank to
+    finish a step sees those of all others: so one of two ranks notices before the next step,
+    whichever is ahead.
 
     It uses the second 64 bits of each line of `flags`, see `SharedBlock`.
     """
@@ -55,7 +55,7 @@ class DesyncDetector:
         self._words[rank] = 0
 
     def record(self, call_index: int, num_floats: int) -> int | None:
-        """Comes to the next exchange; a rank that has come to another one instead, if any."""
+        """Records the next exchange; returns a rank that has reached another one instead."""
         self._count += 1
         which = call_index.to_bytes(8, "little") + num_floats.to_bytes(8, "little")
         self._checksum = zlib.crc32(which, self._checksum)
@@ -141,14 +141,14 @@ class DeviceTransport(HostTransport):
             # On every GPU: the own first, then the following ones, so that not all write to one.
             first, near = leaders(layout), layout.gpu_of(rank)
             owners = first[near:] + first[:near]
-        return IpcBuffers(self._control, self.capacity, group, owners, new_memory, _WISH)
+        return IpcBuffers(self._control, self.capacity, group, owners, new_memory, _FEATURE)
 
     def start(self, checks: Sequence[Callable[[], bool]]) -> None:
         """See `HostTransport`."""
-        all_or_none(self._control, _WISH, self._open)
+        all_or_none(self._control, _FEATURE, self._open)
         for check in checks:
             failure = self._runner.finish(partial(self._try, check))
-            all_or_none(self._control, _WISH, partial(_raise, failure))
+            all_or_none(self._control, _FEATURE, partial(_raise, failure))
         self.exchange_s()  # Not a part of the first step.
 
     def reduce(
@@ -202,13 +202,13 @@ class DeviceTransport(HostTransport):
 
     @contextmanager
     def _exchanging(self, stream: int, call_index: int, num_floats: int) -> Iterator[CudaQueue]:
-        """Counts the time, and makes sure that other ranks come to the same exchange."""
+        """Counts the time, and checks that other ranks are at the same exchange."""
         if self._queue is None or self._desync is None:
             raise RuntimeError("the exchange is closed")
         if (peer := self._desync.record(call_index, num_floats)) is not None:
             gmi, other = (self._here.ids[rank] for rank in (self._here.rank, peer))
             raise RuntimeError(
-                f"GMI {gmi} and GMI {other} have come to their exchanges in different orders; "
+                f"GMI {gmi} and GMI {other} call their exchanges in different orders; "
                 f"here it is number {call_index} of its program, with {num_floats} floats"
             )
         self._queue.start_clock(stream)
@@ -231,7 +231,7 @@ class DeviceTransport(HostTransport):
                 raise RuntimeError("shared GPU memory does not hold what was written into it")
         except Exception as error:  # Whatever it is, the host can take part instead.
             flags[self._here.rank, 0] = _FREE  # The others' devices wait for it.
-            warn_of(_WISH, error)
+            warn_of(_FEATURE, error)
             return error
         return None
 

@@ -77,7 +77,7 @@ class HostTransport:
                 result = self._buffer("target", rows * num_floats)
                 if stage.reads(self._host.rank):
                     fetch(stream, source, values)
-                else:  # A rank comes to the barrier once it has computed, also without numbers.
+                else:  # A rank enters the barrier once it has computed, also without numbers.
                     synchronize(stream)
                 self._reduce(stage, call_index, values, result)
                 store(stream, target, result)

@@ -19,8 +19,8 @@ T = TypeVar("T")
 class Collectives(Protocol):
     """The trainers of a job, from within a program that all of them run.
 
-    XLA may start exchanges that do not need each other in any order, and trainers that come to
-    them in different orders fail: say by `after` what has to be computed before.
+    XLA may start exchanges that do not depend on each other in any order, and trainers that start
+    them in different orders fail: pass as `after` what has to be computed before.
     """
 
     def rank(self) -> jax.Array:
@@ -86,7 +86,7 @@ class TracedStep(Protocol):
 
         Raises:
           PeerLost: the process of another trainer is gone.
-          CollectiveTimeout: another trainer did not come in time, or has not been heard of.
+          CollectiveTimeout: another trainer did not arrive in time, or sent no heartbeat.
           CollectiveError: trainers make different exchanges.
         """
         ...
@@ -94,7 +94,7 @@ class TracedStep(Protocol):
     def wait(self) -> None:
         """Returns when the last call is computed; raises what `__call__` raises.
 
-        Before its results are read: who reads them would wait forever for a trainer that died.
+        Call it before reading the results: a read would wait forever for a trainer that died.
         """
         ...
 
@@ -105,7 +105,7 @@ class Communicator(Protocol):
     Attributes:
       rank: this trainer's number, 0 to `world_size - 1`.
       world_size: K, number of trainers.
-      strategy: which one it is, also where the wanted one was not to be had.
+      strategy: the one in use, also where the requested one was not available.
       intra: how the GMIs of one GPU exchange numbers in `har`, `host` or `ipc`.
       inter: how nodes exchange numbers, `nccl` or `tcp`; None where there is one.
     """

@@ -73,9 +73,9 @@ class StagedAllReduce:
             first = self.sum(values, 1)
             return first, self.sum(values + 1.0, 2, after=first)
 
-        found = jax.jit(two_sums)(jnp.full(self._transport.capacity, self.rank, jnp.float32))
+        sums = jax.jit(two_sums)(jnp.full(self._transport.capacity, self.rank, jnp.float32))
         # Both are read: an error of the device comes with what is read last.
-        arrays = [np.asarray(array) for array in found]
+        arrays = [np.asarray(array) for array in sums]
         # Small integers are exact in any order.
         return all(
             np.all(array == values_after(self._stages, range(k, k + self.world_size))[self.rank])
@@ -107,7 +107,7 @@ class StagedAllReduce:
             raise CollectiveError(f"rank {self.rank}: exchanges float32, not {values.dtype}")
         if values.size > (capacity := self._transport.capacity):
             raise CollectiveError(
-                f"rank {self.rank}: {values.size} floats, room is for {capacity}"
+                f"rank {self.rank}: {values.size} floats exceed the capacity of {capacity}"
             )
         result = jax.ShapeDtypeStruct(shape, jnp.float32)
         call: Any = jax.ffi.ffi_call(self._name, result, has_side_effect=True)

@@ -1,8 +1,8 @@
 """Shared memory without a name: the controller makes it, its processes inherit and map it.
 
 An anonymous file vanishes with the last process that has it open, so nothing is left behind
-whoever gets killed, and it does not count against the size of /dev/shm. `Fence` keeps the order of
-accesses to it.
+whichever process is killed, and it does not count against the size of /dev/shm. `Fence` keeps the
+order of accesses to it.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ def create_file(name: str, num_bytes: int = 0) -> int:
     return fd
 
 
-def map_file(fd: int, num_bytes: int, who: str) -> mmap.mmap:
-    """Maps a file that gets its size here, from whoever comes first; all its memory is taken.
+def map_file(fd: int, num_bytes: int, user: str) -> mmap.mmap:
+    """Maps a file whose size the first process to map it sets; all its memory is taken.
 
     Raises:
-      CollectiveError: no memory, or no such descriptor; names `who`.
+      CollectiveError: no memory, or no such descriptor; names `user`.
     """
     try:
         # Unlike ftruncate this never shrinks the file, which would crash (SIGBUS) processes that
@@ -61,7 +61,7 @@ def map_file(fd: int, num_bytes: int, who: str) -> mmap.mmap:
         return mmap.mmap(fd, num_bytes, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
     except OSError as error:
         raise CollectiveError(
-            f"{who}: cannot map {num_bytes / 2**20:.1f} MiB of shared memory at descriptor {fd} "
+            f"{user}: cannot map {num_bytes / 2**20:.1f} MiB of shared memory at descriptor {fd} "
             f"({error.strerror})"
         ) from None
 

@@ -40,7 +40,7 @@ class ReductionStage(NamedTuple):
     groups: Groups
 
     def reads(self, rank: int) -> bool:
-        """Whether somebody gets what this rank has; else it is only given something."""
+        """Whether another rank gets what this rank has; else it only receives."""
         if self.kind == "broadcast" or self.transport == "nodes":
             return not any(rank in group[1:] for group in self.groups)
         return True
@@ -93,17 +93,17 @@ def inside_nodes(parts: Sequence[ReductionStage], layout: Layout) -> Sequence[Re
 
 def values_after(parts: Sequence[ReductionStage], values: Sequence[int]) -> list[int]:
     """What ranks that begin with these numbers, by rank, have after these stages."""
-    found = list(values)
+    held = list(values)
     for stage in parts:
         if stage.transport == "nodes":
-            found = [sum(found[group[0]] for group in stage.groups)] * len(found)
+            held = [sum(held[group[0]] for group in stage.groups)] * len(held)
             continue
         for group in stage.groups:
             is_sum = stage.kind != "broadcast"
-            result = sum(found[rank] for rank in group) if is_sum else found[group[0]]
+            result = sum(held[rank] for rank in group) if is_sum else held[group[0]]
             for rank in group:
-                found[rank] = result
-    return found
+                held[rank] = result
+    return held
 
 
 def _crosses_nodes(stage: ReductionStage, layout: Layout) -> bool:

@@ -134,28 +134,28 @@ def register(name: str, call: Call) -> None:
 
 
 def _describe(frame: Any) -> None:
-    """Tells XLA which version this is made for: its own, if what is used is the same there."""
+    """Sets the version for which this is made: XLA's own, if what is used is the same there."""
     metadata, version = frame.extension.contents.metadata.contents, frame.api.contents.version
     metadata.version.major, metadata.version.minor = MAJOR_VERSION, version.minor
     metadata.traits = 0
 
 
 def _buffers(values: Any) -> list[Buffer]:
-    found = []
+    buffers = []
     for index in range(values.size):
         buffer = values.values[index].contents
-        found.append(Buffer(buffer.data or 0, tuple(buffer.dims[: buffer.rank])))
-    return found
+        buffers.append(Buffer(buffer.data or 0, tuple(buffer.dims[: buffer.rank])))
+    return buffers
 
 
 def _integers(attributes: Any) -> list[int]:
-    found = []
+    integers = []
     for index in range(attributes.size):
         value = attributes.values[index].contents
         if attributes.types[index] != _SCALAR or value.dtype != _INT64:
             raise TypeError(f"attribute {index} is no int64")
-        found.append(value.value[0])
-    return found
+        integers.append(value.value[0])
+    return integers
 
 
 def _stream(frame: Any) -> int:

@@ -25,7 +25,7 @@ class ChannelConfig(KeyGroup):
         default="memory",
     )
     capacity_mib: int = doc(
-        "room between every agent and every trainer, MiB; a transfer may take a quarter of it",
+        "buffer between every agent and every trainer, MiB; a transfer may take a quarter of it",
         default=64,
         low=1,
     )

@@ -24,7 +24,7 @@ class PackConfig(JobsConfig):
         "how often a command without a grid is run, e.g. an agent of a sweep", default=None, low=1
     )
     commands: str | None = doc(
-        "file with a command in every line, in place of one after --; - is the standard input",
+        "file with a command in every line, instead of one after --; - is the standard input",
         default=None,
     )
     backend: Literal["auto", "mps", "share"] = doc(
@@ -55,7 +55,7 @@ class PackConfig(JobsConfig):
         default=None,
     )
     tag: str | None = doc(
-        "TensorBoard tag of what jobs are ranked by, in place of a metric; read from event files "
+        "TensorBoard tag of what jobs are ranked by, instead of a metric; read from event files "
         "below the job's {run_dir}",
         default=None,
     )

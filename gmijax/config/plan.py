@@ -63,7 +63,7 @@ class PlanConfig(KeyGroup):
     template: Literal["auto", TemplateName] = doc("how roles map to GMIs", default="auto")
     self_check: Literal["auto", "on", "off"] = doc(
         "compare matrix products with float64 when a GMI starts; auto: where SMs are capped, or "
-        "an MPS daemon of somebody else may cap them",
+        "an MPS daemon that gmijax did not start may cap them",
         default="auto",
     )
     serving_gpus: int | tuple[int, ...] | None = doc(

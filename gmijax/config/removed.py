@@ -14,7 +14,7 @@ class Removed(NamedTuple):
 
     Attributes:
       write: what to write now.
-      harmless: saved values with which a run goes on as it did; None: all of them.
+      harmless: saved values with which a run continues as before; None: all of them.
     """
 
     write: str
@@ -24,7 +24,7 @@ class Removed(NamedTuple):
 REMOVED: Final[Mapping[str, Removed]] = MappingProxyType(
     {
         "reduce.selection": Removed(
-            "in place of paper write reduce.strategy=paper; device is the default, and measured "
+            "instead of paper write reduce.strategy=paper; device is the default, and measured "
             "never took another strategy than it does",
             ("device",),
         ),

@@ -52,7 +52,7 @@ class TrainConfig(KeyGroup):
         if self.eval.every is not None and self.is_decoupled:
             raise ConfigError(
                 f"eval.every={self.eval.every}: with algo={self.algo.name} agents act all the "
-                "time, and nobody evaluates; allowed: null (gmijax.play evaluates a checkpoint)"
+                "time, and no GMI evaluates; allowed: null (gmijax.play evaluates a checkpoint)"
             )
         num_envs = None if self.num_envs == "auto" else self.num_envs
         self.algo.check_job(num_envs, self.plan)

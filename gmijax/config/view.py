@@ -12,7 +12,7 @@ from gmijax.errors import ConfigError
 
 @dataclass(frozen=True, kw_only=True)
 class PageConfig(KeyGroup):
-    """Where the page is served, and to whom."""
+    """Where the page is served, and which clients may open it."""
 
     prefix = "view."
 

@@ -26,7 +26,7 @@ _DECISIONS = (
     *("template ", "strategy ", "backend ", "intra ", "inter ", "physics.impl ", "sm_percent "),
     *("GPUs ", "nodes "),
 )
-"""Beginnings of reasons of decisions. Other lines, such as warnings, are for everybody."""
+"""Beginnings of reasons of decisions. Other lines, such as warnings, are always printed."""
 
 
 class _BestEffortStream:
@@ -115,7 +115,7 @@ def open_console(*, show: Show) -> UserConsole:
 
 @contextmanager
 def doing(console: Console, what: str) -> Iterator[None]:
-    """Says what is done: on a terminal with a clock for as long as it takes, elsewhere once."""
+    """Prints what is done: on a terminal with a clock for as long as it takes, elsewhere once."""
     if not console.is_interactive:
         console.print(what)
         yield

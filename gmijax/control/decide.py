@@ -54,7 +54,7 @@ def decide(config: C, console: Console, nodes: Mapping[str, Machine] | None = No
     machine = next(iter(nodes.values())) if nodes else detect_machine()
     config, found = with_auto_decided(config, machine, console)
     if isinstance(config, ServeConfig):
-        # Nobody trains, so nobody averages gradients.
+        # No GMI trains, so none averages gradients.
         nothing, num_envs = ReduceConfig(), config.envs_per_gmi
         plan = make_plan(config.plan, nothing, num_envs, machine, template="tcg")
     else:

@@ -1,4 +1,4 @@
-"""A display that goes on while a job or a sweep runs."""
+"""A display that is updated while a job or a sweep runs."""
 
 from __future__ import annotations
 

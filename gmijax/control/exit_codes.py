@@ -64,7 +64,7 @@ def _require_working_folder() -> None:
 
 @contextmanager
 def _interrupted_by_signals() -> Iterator[None]:
-    """Has all signals that ask for an end do what Ctrl-C does, until a job hears them itself.
+    """Makes all stop signals do what Ctrl-C does, until a job handles them itself.
 
     What is ignored stays ignored, as by `nohup`.
     """

@@ -16,7 +16,7 @@ OPENGL_TIMEOUT_S: Final = 60.0
 
 
 class Extra(NamedTuple):
-    """Something that needs packages which not everybody has."""
+    """Something that needs optional packages."""
 
     packages: tuple[str, ...]
     brings: str  # What it is good for.

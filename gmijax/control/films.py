@@ -25,7 +25,7 @@ LAST_FILM_TIMEOUT_S: Final = 120.0
 _GIVE_UP_S: Final = 5.0
 
 FINISH: Final = b"finish"
-"""Tells the process that draws to film what is left before it ends."""
+"""Makes the process that renders film what is left before it ends."""
 
 
 def find_opengl(config: TrainConfig) -> str | None:

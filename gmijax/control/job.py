@@ -80,7 +80,7 @@ def train(config: TrainConfig, *, show: Show = False) -> Result:
       ConfigError: bad input, before anything was started.
       GmiFailed: a GMI failed, and starting again did not help or would not have; the run folder
         holds the logs and the last checkpoint.
-      JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came; its note says what is left to
+      JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came; its note has what is left to
         resume.
     """
     started_s = time.monotonic()

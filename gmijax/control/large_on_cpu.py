@@ -1,4 +1,4 @@
-"""What to say of a training that is large for a machine without a GPU."""
+"""The warning for a training that is large for a machine without a GPU."""
 
 from __future__ import annotations
 

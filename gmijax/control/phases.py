@@ -38,7 +38,7 @@ class Phases:
         self._is_noted = False
 
     def enter(self, gmis: Sequence[GmiStatus]) -> str | None:
-        """Takes in the states of the GMIs; what is to be said of a new phase, if anything."""
+        """Updates the phase from the states of the GMIs; the line for a new one, if any."""
         before, phase = self.now, _phase_of(gmis)
         if phase == before:
             return None

@@ -57,7 +57,7 @@ class ConsoleProgress:
 
     def __exit__(self, *exc: Any) -> None:
         self._display.__exit__(*exc)
-        # A panel is gone then; what a line has said is not said again.
+        # A panel is gone then; a line that was printed is not printed again.
         if self._line and (self._display.has_panel or self._line["env_steps"] != self._shown[1]):
             self._console.print(self._text())
 

@@ -1,4 +1,4 @@
-"""The plan of a job that goes on without the GPUs or nodes that it has lost."""
+"""The plan of a job that continues without the GPUs or nodes that it has lost."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gmijax.supervise.job_kinds import training_plan
 def with_gpus_left(
     config: TrainConfig, plan: Plan, machine: Machine
 ) -> tuple[TrainConfig, Plan, tuple[str, ...]]:
-    """The job as it can go on, with Algorithm 1 decided again where GPUs are gone.
+    """The job as it can continue, with Algorithm 1 decided again where GPUs are gone.
 
     Every GMI keeps its number of environments, so there are fewer of them in all.
 
@@ -23,7 +23,7 @@ def with_gpus_left(
       Configuration and plan, both as they were where no GPU is gone, and sentences for the user.
 
     Raises:
-      ConfigError: GPUs are gone, and the job may not or cannot go on with those that are left.
+      ConfigError: GPUs are gone, and the job may not or cannot continue with those that are left.
     """
     lost = _lost(plan, machine)
     if not lost:
@@ -69,7 +69,7 @@ def _lost(plan: Plan, machine: Machine) -> set[int]:
 
 
 def _without(config: TrainConfig, plan: Plan, machine: Machine, lost: set[int]) -> PlanConfig:
-    """The user's wishes for the GPUs that are left, which keep their indices."""
+    """The requested plan for the GPUs that are left, which keep their indices."""
     kept = [position for position in range(plan.layout.num_gpus) if position not in lost]
     index_of = machine.index_of_device
     device_of = {allocation.gpu: allocation.device for allocation in plan.allocations}

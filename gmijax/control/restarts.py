@@ -80,7 +80,7 @@ class Attempts:
         """Runs the job; raises as `run_gmis` of the last attempt does."""
         budget, last, reached = self.max_restarts, None, _steps(checkpoint)
         is_own = checkpoint is not None and checkpoint.parent == self.run.checkpoints
-        # Before its own first one, a resumed run goes on from where it came from.
+        # Before its own first one, a resumed run continues from the one that it was resumed from.
         origin = None if is_own else checkpoint
         with stop_signals() as signals:
             while True:
@@ -137,7 +137,7 @@ class Attempts:
         return tick
 
     def _last_fault(self, why: ConfigError) -> GmiFailed:
-        """What ended the attempt before, after which the machine cannot go on."""
+        """What ended the attempt before, after which the machine cannot continue."""
         fault = self.restarts[-1]
         failed = GmiFailed(fault.gmi, fault.cause, iteration=fault.iteration)
         failed.add_note(f"cannot start again: {why}")

@@ -101,7 +101,7 @@ def drop_half_written(run: RunPaths) -> None:
 
 
 def begin_again(run: RunPaths, checkpoint: Path | None) -> None:
-    """Prepares a run folder that exists for a job that goes on from a checkpoint, or begins.
+    """Prepares a run folder that exists for a job that continues from a checkpoint, or begins.
 
     What was trained there without a checkpoint is lost, but not its metrics.
     """
@@ -164,7 +164,7 @@ def record_end(
 
 
 def what_is_left(config: TrainConfig, run: RunPaths) -> str:
-    """Says what an interrupted job has left, and how it can be continued."""
+    """The line about what an interrupted job has left, and how it can be continued."""
     folder, result = nearby(run.root), run.gmi(0).result
     status = read_json(result)["status"] if result.exists() else None
     if status == "completed":

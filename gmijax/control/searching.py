@@ -21,7 +21,7 @@ def search(
     """Finds environments per GMI and GMIs per GPU for a training job, where they are `auto`.
 
     Args:
-      config: see `gmijax.compose(..., command="search")`; its `search` says how.
+      config: see `gmijax.compose(..., command="search")`; its `search` has the settings.
       show: print progress, a table and the answer.
       overrides: `key=value` from which `config` was made, for the command that is printed last.
 

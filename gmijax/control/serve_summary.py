@@ -38,7 +38,7 @@ def serve_summary(
         "serve_wall_s": _largest(collecting, "serve_wall_s"),
         "compile_s": _largest(list(found.values()), "compile_s"),
         "env_steps_per_s": _throughput(collecting),
-        # In a job that goes on, a GMI may have nothing left to collect.
+        # In a continued job, a GMI may have nothing left to collect.
         "step_per_s_inference": _total(
             [result for result in collecting if result["env_steps"]], "step_per_s_inference"
         ),

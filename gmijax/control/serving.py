@@ -101,7 +101,7 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
     Raises:
       ConfigError: bad input, before anything was started.
       GmiFailed: a GMI failed; finished shards of experience stay.
-      JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came; the same command goes on with what
+      JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came; the same command continues with what
         is there.
     """
     require_config(config, ServeConfig)

@@ -45,7 +45,7 @@ class StartPoint(NamedTuple):
 
     # The run folder if it exists already, None if a new one is to be made.
     folder: RunPaths | None = None
-    checkpoint: Path | None = None  # What the job goes on from, None from its beginning.
+    checkpoint: Path | None = None  # What the job continues from, None from its beginning.
     is_complete: bool = False  # Whether the checkpoint has all steps that are wanted.
     notes: tuple[str, ...] = ()  # Sentences for the user.
 
@@ -98,7 +98,7 @@ def _untrained(config: TrainConfig) -> RunPaths | None:
 
 def has_trained(run: RunPaths) -> bool:
     """Whether anything was trained in a run folder."""
-    # Not as the summary says, which may be of an attempt before one that was killed.
+    # Not from the summary, which may be of an attempt before one that was killed.
     return bool(checkpoints_of(run.root) or read_metrics(run.metrics))
 
 
@@ -141,7 +141,7 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
 
 
 def _begins_anew(run: RunPaths) -> tuple[str, ...]:
-    """Says what becomes of what was trained without a checkpoint; nothing where nothing was."""
+    """The warning about steps that were trained without a checkpoint, if there are any."""
     if (steps := last_env_steps(run.metrics)) is None:
         return ()
     kept = nearby(run.earlier_metrics(steps))
@@ -161,9 +161,9 @@ def replay_line(config: TrainConfig, plan: Plan) -> tuple[str, ...]:
 
 
 def forgotten(config: TrainConfig, plan: Plan) -> str | None:
-    """What a job that goes on from a checkpoint has experienced and does not know any more.
+    """The line about the replay that a job which continues from a checkpoint does not have.
 
-    None where it goes on with all that it had, or had nothing.
+    None where it continues with its whole replay, or never had one.
     """
     replay = config.algo.kept_replay
     if config.run.resume is None or replay is None:
@@ -190,7 +190,7 @@ def forgotten(config: TrainConfig, plan: Plan) -> str | None:
 
 
 def require_replay_fits(config: TrainConfig, plan: Plan, checkpoint: Path | None) -> None:
-    """Raises `ConfigError` where a job would go on with a saved replay of other sizes."""
+    """Raises `ConfigError` where a job would continue with a saved replay of other sizes."""
     replay = config.algo.kept_replay
     if checkpoint is None or replay is None or not replay.is_saved:
         return
@@ -215,7 +215,7 @@ def _environments_go_on(config: TrainConfig, plan: Plan, checkpoint: Path) -> bo
 def _require_fit(
     config: TrainConfig, checkpoint: Path, saved: Mapping[str, Any], wanted: str
 ) -> CheckpointMeta:
-    """The checkpoint's meta data, if the job can go on from it; `saved` is its configuration."""
+    """The checkpoint's meta data, if the job can resume from it; `saved` is its configuration."""
     meta = CheckpointMeta.read(checkpoint)
     for name, have, want in (
         ("task", meta.env, config.env.label),

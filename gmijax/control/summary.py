@@ -191,7 +191,7 @@ def _of_videos(run: RunPaths) -> str:
 
 
 def plan_data(plan: Plan) -> dict[str, Any]:
-    """What a summary says of the plan."""
+    """What a summary has of the plan."""
     return {
         "backend": plan.backend,
         "layout": [list(gmis) for gmis in plan.layout.gmis_of_gpu],

@@ -112,14 +112,14 @@ def ask_jax(machine: Machine) -> JaxView:
     if done.returncode:
         lines = done.stderr.strip().splitlines()
         return JaxView(None, error=lines[-1] if lines else f"exit code {done.returncode}")
-    said = json.loads(done.stdout.strip().splitlines()[-1])
-    return JaxView(said["platform"], tuple(said["devices"]))
+    probe = json.loads(done.stdout.strip().splitlines()[-1])
+    return JaxView(probe["platform"], tuple(probe["devices"]))
 
 
 def try_mps(machine: Machine) -> str | None:
     """Starts an MPS daemon as a job would and ends it again; the error, None if there is none.
 
-    Not tried where MPS is not installed, somebody's daemon runs, or no GPU can take one.
+    Not tried where MPS is not installed, a daemon runs already, or no GPU can take one.
     """
     whole = [gpu for gpu in machine.gpus if device_of(gpu) and not gpu.mig_enabled]
     if machine.mps_control is None or machine.operator_daemon is not None or not whole:

@@ -11,7 +11,7 @@ _RATE_OVER_S: Final = 60.0
 
 _LEAST_REPORTS: Final = 4
 _LEAST_S: Final = 5.0
-"""Before so many reports in so long a rate says little: the first iterations are unlike others."""
+"""Before so many reports in so long a rate is unreliable: the first iterations are different."""
 
 
 class TimeLeft:
@@ -21,7 +21,7 @@ class TimeLeft:
         self._reports: deque[tuple[float, int]] = deque()
 
     def note(self, env_steps: int) -> None:
-        """Takes in the steps so far; may be called as often as one likes."""
+        """Adds the steps so far; may be called as often as one likes."""
         now_s, reports = time.monotonic(), self._reports
         if reports and env_steps == reports[-1][1]:
             return
@@ -32,7 +32,7 @@ class TimeLeft:
             reports.popleft()
 
     def seconds(self, num_timesteps: int) -> float | None:
-        """Until there are so many steps; None at the end, or while no rate says much yet."""
+        """Until there are so many steps; None at the end, or while no rate is reliable yet."""
         if len(self._reports) < _LEAST_REPORTS:
             return None
         (first_s, first), (last_s, last) = self._reports[0], self._reports[-1]

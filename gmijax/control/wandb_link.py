@@ -40,7 +40,7 @@ def followed(
     Args:
       config: of the run.
       run: its folder.
-      checkpoint: what it goes on from, if anything: the run of that is continued at Weights &
+      checkpoint: what it continues from, if anything: the run of that is continued at Weights &
         Biases too.
       say: takes a line for the user.
     """

@@ -23,7 +23,7 @@ def onnx_content(policy: TrainedPolicy, metadata: Mapping[str, Any]) -> bytes:
 
     Every entry of `metadata` becomes one of the model's own, its value as JSON.
     """
-    # Hundreds of modules, which nobody else needs.
+    # Hundreds of modules, which nothing else needs.
     import jax2onnx
     import onnx
 

@@ -54,7 +54,7 @@ def film(
     Args:
       config: what is filmed.
       paths: where the trajectory is, and the film goes.
-      camera: what to say of the camera.
+      camera: a text about the camera.
       console: for the user.
       seconds: a brief film, which takes about so long to draw; None: all of it.
 

@@ -134,7 +134,7 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
 
 
 def walking_lines(config: PlayConfig, walk: Mapping[str, Any] | None) -> str:
-    """What is said of a walking test: its results, or why there was none."""
+    """The lines of a walking test: its results, or why there was none."""
     if walk is not None:
         return "\n".join(lines_of(walk))
     if config.walking_envs == 0:
@@ -146,7 +146,7 @@ def walking_lines(config: PlayConfig, walk: Mapping[str, Any] | None) -> str:
 
 
 def _return_while_training(config: PlayConfig, returns: Mapping[str, Any]) -> str | None:
-    """A line that says why training printed another return; None where it did not."""
+    """A line on why training printed another return; None where it did not."""
     lines = read_metrics(RunPaths(Path(str(config.run.dir))).metrics)
     at_it = [line.get("return") for line in lines if line["env_steps"] == returns["env_steps"]]
     if not at_it or at_it[-1] is None or not returns["deterministic"]:
@@ -209,7 +209,7 @@ def launch_of(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:
 
 
 def without_film(config: PlayConfig, env: str, console: Console) -> None:
-    """Says that there is no film of an environment without a model, if one was wanted."""
+    """Prints that an environment without a model has no film; an error if one was requested."""
     reason = f"{env} has no model that could be filmed; the returns were evaluated"
     if config.video not in ("auto", "none") or config.html == "on":
         raise GmijaxError(reason)

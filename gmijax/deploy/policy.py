@@ -30,7 +30,7 @@ class Policy:
     Attributes:
       obs_size: O, length of an observation.
       action_size: A, length of an action.
-      metadata: what the policy is, as `policy.json` of an export says it.
+      metadata: what the policy is, as in `policy.json` of an export.
     """
 
     def __init__(
@@ -66,8 +66,8 @@ class Policy:
 def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Loads a trained policy.
 
-    A file is a program that is run: load only those of people whom you trust. A RuntimeWarning
-    names every damaged checkpoint that was passed over for an older one.
+    Loading a file runs code in it: load files only from sources that you trust. A RuntimeWarning
+    names every damaged checkpoint that was skipped for an older one.
 
     Args:
       path: a run folder (its newest checkpoint), a checkpoint folder, `last`, or a file that

@@ -27,7 +27,7 @@ def checked(config: PlayConfig) -> PlayConfig:
     Raises:
       ConfigError: no policy of this task is shipped, or it cannot be played so.
     """
-    require_alone("run.dir", config.run.dir)  # Who names a run has no task to name.
+    require_alone("run.dir", config.run.dir)  # A run has its own task.
     require_shipped(config.run.env)
     require_alone("deterministic", config.deterministic, True)
     require_alone("randomize", config.randomize, "off")

@@ -1,8 +1,8 @@
 """An iteration of distillation: a rollout of the student, labelled by the teacher, then updates.
 
-The student acts and the teacher says what it would have done in the same states (DAgger,
+The student acts and the teacher labels the same states with its own actions (DAgger,
 arXiv:1011.0686, with the newest rollout alone, as rsl_rl has it, arXiv:2509.10771). So the student
-learns in states that it comes to itself, and may see less than the teacher does.
+learns in states that it reaches itself, and may see less than the teacher does.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ T = TypeVar("T")
 LEARNER = "learner"
 
 EPISODES = "episodes.json"
-"""The latest episodes before a checkpoint, over which metrics go on after it."""
+"""The latest episodes before a checkpoint, which metrics after it include."""
 
 
 def checkpoint_meta(
@@ -106,7 +106,7 @@ def save_replay(paths: RunPaths, env_steps: int, gmi: int, replay: PyTree) -> No
 
 
 def require_disk_for(run: RunPaths, replay: PyTree | None, num_gmis: int) -> None:
-    """Raises `ConfigError` if the disk of a run has no room for the replays of so many GMIs.
+    """Raises `ConfigError` if the disk of a run has no space for the replays of so many GMIs.
 
     `replay` may be shapes and dtypes; None: there is none to be saved.
     """

@@ -26,7 +26,7 @@ class CheckpointPart(NamedTuple):
     Attributes:
       run: the run folder.
       meta: of the checkpoint.
-      learner_state: the same on all GMIs; None but for the leader, who writes it.
+      learner_state: the same on all GMIs; None except on the leader, which writes it.
       env_state: this GMI's environments, None where it has none.
       save_more: writes what else the leader has for it, given the learner's state.
       replay: this GMI's experience, None where checkpoints hold none.
@@ -88,9 +88,9 @@ class CheckpointSaver:
         self._thread.report(write)
 
     def name(self) -> None:
-        """Gives the checkpoints their names soon: all GMIs have said that theirs are written.
+        """Gives the checkpoints their names soon: all GMIs have reported theirs as written.
 
-        All at once, so that runs that share a program go on from the same step after a fault.
+        All at once, so that runs that share a program continue from the same step after a fault.
         """
         parts, self._unnamed = self._unnamed, ()
         self.last_steps = parts[0].meta.env_steps
@@ -106,7 +106,7 @@ class CheckpointSaver:
             self._barrier()
             self.name()
             self._thread.wait()
-            self._barrier()  # Nobody may look for the folder before it has its name.
+            self._barrier()  # No GMI may look for the folder before it has its name.
 
     def stop(self) -> None:
         """Ends the thread, which may finish what it does. Idempotent."""

@@ -37,7 +37,7 @@ _INVERSE_STDS = (
 class Normal:
     """A diagonal Gaussian of actions [A], one for every state, around the network's output.
 
-    `output` [..., H] is what the network says of a state; `log_std` [A] are weights beside it
+    `output` [..., H] is the network's output for a state; `log_std` [A] are weights beside it
     that all states share. With `state_dependent_std` the output [..., 2 A] holds, behind the
     means, what is added to `log_std`. What is drawn is a raw action: the environment gets
     `action_of` it, learning keeps the raw one. Log densities, entropies and divergences are in

@@ -1,4 +1,4 @@
-"""What a GMI does for films of evaluations: it leaves trajectories for who draws them."""
+"""A GMI's part in films of evaluations: it writes trajectories that another process renders."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class EpisodeWindow:
         self._names: tuple[str, ...] = ()
 
     def add(self, episodes: Any, steps: float = 0.0) -> None:
-        """Takes in the `EpisodeSums` of `steps` environment steps, as numbers of the host."""
+        """Adds the `EpisodeSums` of `steps` environment steps, as numbers of the host."""
         self._steps += steps
         self._names = _names_of(episodes)
         if not episodes.count:
@@ -107,7 +107,7 @@ class EpisodeWindow:
         return {"steps": self._steps, "began": self._began, "ended": ended}
 
     def restore(self, state: Mapping[str, Any], *, envs_go_on: bool) -> None:
-        """Goes on from what `state` returned.
+        """Continues from what `state` returned.
 
         Args:
           state: of the run that this one continues, with the same task.

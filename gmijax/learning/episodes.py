@@ -17,7 +17,7 @@ import numpy as np
 
 from gmijax.compile_once import compile_once
 from gmijax.learning.learner import Learner, TrainState, acting_weights
-from gmijax.learning.memory import require_room
+from gmijax.learning.memory import require_memory
 from gmijax.learning.unroll import act, unroll
 from gmijax.player.outcome import Episodes
 from gmijax.sim.divergence import diverged_by_source, end_diverged
@@ -77,7 +77,7 @@ class EpisodeRunner:
         """
         started = time.monotonic()
         batch, _ = jax.eval_shape(self._begin, self._model, self._keys)
-        require_room(self._options.key, self._options.num_envs, batch)
+        require_memory(self._options.key, self._options.num_envs, batch)
         self._begin = self._begin.lower(self._model, self._keys)
         self._chunk = self._chunk.lower(self._model, state, self._step_limit(), batch)
         self._compile_s += time.monotonic() - started
@@ -94,7 +94,7 @@ class EpisodeRunner:
         Args:
           state: weights and the observations' statistics.
           go_on: called after every chunk with the number of chunks done, and whether any episode
-            still runs; says whether to run another chunk.
+            still runs; returns whether to run another chunk.
         """
         started = time.monotonic()
         batch, shown = self._begin(self._model, self._keys)

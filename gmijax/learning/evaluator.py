@@ -1,7 +1,7 @@
 """Evaluation while training: whole episodes with the policy as it is, run by all GMIs that train.
 
 The environments are the evaluations' own, and so are their random keys: episode j of an evaluation
-is environment 2^30 + j of the job. So training goes on as if there were no evaluations, all
+is environment 2^30 + j of the job. So training continues as if there were no evaluations, all
 evaluations of a run begin in the same states, and how many GMIs share the episodes makes no
 difference.
 """
@@ -151,7 +151,7 @@ class Evaluator:
         is_given_up = False
 
         def go_on(_: int, running: bool) -> bool:
-            # Together after every part: nobody waits long for those with longer episodes.
+            # Together after every part: no GMI waits long for those with longer episodes.
             nonlocal is_given_up
             beat()
             mine = np.array([running, must_stop()], np.float32)

@@ -112,7 +112,7 @@ class IterationTrace:
         self._folder.mkdir(exist_ok=True)
         self._before = self._traces()
         options = jax.profiler.ProfileOptions()
-        # Calls of Python are many, slow the iteration down, and say little about it.
+        # Calls of Python are many, slow the iteration down, and show little about it.
         options.python_tracer_level = 0
         jax.profiler.start_trace(self._folder, profiler_options=options)
         self._is_open = True

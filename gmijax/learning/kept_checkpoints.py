@@ -15,10 +15,10 @@ from gmijax.runs.ranking import ranked
 
 def keep_best(paths: RunPaths, keep: int, last: Path) -> None:
     """Leaves so many checkpoints up to `last`: that, the best one (`ranked`), the newest ones."""
-    # Later ones, which a restart has passed over, are in nobody's place.
-    found = [path for path in checkpoints_of(paths.root) if path.name <= last.name]
-    best = ranked(found)[0][1]
-    others = [path for path in found if path != best]
+    # Later ones, which a restart has skipped, do not count.
+    checkpoints = [path for path in checkpoints_of(paths.root) if path.name <= last.name]
+    best = ranked(checkpoints)[0][1]
+    others = [path for path in checkpoints if path != best]
     num_others = max(keep - 1, int(best != last))
     for path in others[: max(0, len(others) - num_others)]:
         remove(paths, path)

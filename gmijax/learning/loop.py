@@ -167,7 +167,7 @@ class TrainingLoop:
         template = self._algorithm.replay(self._learner, made)
         require_disk_for(members.first.run, template, ranks.world_size)
         replay = members.restored_replay(template, gmi, ranks.world_size)
-        # In a program, which makes a replay where it stays: there may be no room for another.
+        # In a program, which makes a replay where it stays: there may be no memory for another.
         make = jax.jit(members.each(begin), donate_argnums=(0, 1))
         return make(envs, jax.device_put(replay))
 
@@ -223,7 +223,7 @@ class TrainingLoop:
             self._env_steps += self._steps_per_iteration
             evaluation = self._evaluate(state)
             thread.report(self._env_steps, metrics, self._times(), evaluation)
-            # Counted from the run's start, so that it says the same after a restart.
+            # Counted from the run's start, so that it is the same after a restart.
             self._link.beat("running", self._env_steps // self._steps_per_iteration)
             stop = self._agree_to_stop()
             is_last = stop or self._env_steps >= num_timesteps
@@ -234,7 +234,7 @@ class TrainingLoop:
         replay = None if self._remote else self._algorithm.replay(self._learner, memory)
         if replay is not None:
             # It can be many GiB: written once, and last, since time or disk may not suffice for
-            # it. This checkpoint then takes the place of the one without it.
+            # it. This checkpoint then replaces the one without it.
             self._save(state, memory, replay, thread, evaluation)
         self._saver.finish()
         self._trace.close()  # Last: a job that is to end has little time to save.
@@ -262,9 +262,9 @@ class TrainingLoop:
         return {**times, **self._other_times()}
 
     def _agree_to_stop(self) -> bool:
-        # Only one GMI may have heard of it yet; all must leave after the same iteration.
-        mine = np.array([self._link.stop_requested, self._saver.is_written], np.float32)
-        stops, are_written = self._comm.all_gather(mine).T
+        # A request may have reached only one GMI yet; all must stop after the same iteration.
+        local = np.array([self._link.stop_requested, self._saver.is_written], np.float32)
+        stops, are_written = self._comm.all_gather(local).T
         if are_written.all():
             self._saver.name()
         return bool(stops.any())
@@ -277,9 +277,9 @@ class TrainingLoop:
         thread: ReportThread,
         evaluation: Evaluation | None,
     ) -> None:
-        """Begins to write a checkpoint of every run; training goes on meanwhile."""
+        """Begins to write a checkpoint of every run; training continues meanwhile."""
         self._iteration.wait()
-        thread.wait()  # A resumed run goes on from the lines up to its checkpoint.
+        thread.wait()  # A resumed run continues after the lines up to its checkpoint.
         self._saver.finish()  # Two copies on the host at once may be too much.
         learned = self._algorithm.learned(state)
         require_equal(self._comm, self._link.gmi, learned, self._env_steps)

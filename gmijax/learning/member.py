@@ -43,7 +43,7 @@ class Member:
     Attributes:
       config: of the run.
       run: its run folder.
-      error: why it has ended before the others, None while it goes on.
+      error: why it has ended before the others, None while it runs.
     """
 
     def __init__(self, config: TrainConfig, run: RunPaths) -> None:
@@ -135,7 +135,7 @@ class Members:
         return make if self.is_one else jax.vmap(make)
 
     def restored_replay(self, template: PyTree, gmi: int, num_gmis: int) -> PyTree | None:
-        """What the checkpoints that all runs go on from hold of `template`, in the host's memory.
+        """What the checkpoints that all runs resume from hold of `template`, in the host's memory.
 
         With an axis of runs where there are several, as `template` has; None where a run begins
         without.

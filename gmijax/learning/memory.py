@@ -26,7 +26,7 @@ def in_gib(num_bytes: float) -> str:
     return f"{num_bytes / 2**30:.3g} GiB"
 
 
-def require_room(key: str, num_envs: int, state: PyTree) -> None:
+def require_memory(key: str, num_envs: int, state: PyTree) -> None:
     """Raises ConfigError if the state of so many environments is more than the memory.
 
     Args:

@@ -28,10 +28,10 @@ def check_diverged(where: str, diverged: Mapping[str, float], steps: float) -> N
       NonFiniteError: more than `TOLERATED_FRACTION` of them and more than `TOLERATED_STEPS`.
     """
     if diverged["any"] > max(TOLERATED_STEPS, TOLERATED_FRACTION * steps):
-        places = [name for name, count in diverged.items() if count and name != "any"]
+        arrays = [name for name, count in diverged.items() if count and name != "any"]
         raise NonFiniteError(
             f"{where}: {diverged['any']:.0f} of {steps:.0f} steps gave numbers that are not "
-            f"finite or beyond all bounds, in {', '.join(places)}"
+            f"finite or beyond all bounds, in {', '.join(arrays)}"
         )
 
 
@@ -57,7 +57,7 @@ class OverflowCount:
         self.steps: dict[str, float] = {}
 
     def add(self, overflowed: Mapping[str, float]) -> None:
-        """Takes in steps by buffer, of one iteration or unroll."""
+        """Adds steps by buffer, of one iteration or unroll."""
         for name, count in overflowed.items():
             before = self.steps.get(name, 0.0)
             if count and not before:

@@ -2,8 +2,7 @@
 
 The sizes are those of the paper's Table 6 (256:128:64 for most tasks); ELU activations and a
 state-independent standard deviation are what Isaac Gym's PPO uses for the same tasks, layer norm
-and SiLU what FastSAC does. What the output of the policy's network means is said by its
-distribution.
+and SiLU what FastSAC does. The distribution defines what the output of the policy's network means.
 
 In bfloat16, the hidden layers and what goes from one to the next are in it: their products are
 quicker, and half as many bytes are moved. Weights, and all that comes of a network, stay float32.
@@ -123,8 +122,8 @@ class ActorCritic(NamedTuple):
         return ActorCriticParams(
             policy=self.policy.init(policy_key, obs[:, : self.actor_obs_size]),
             value=self.value.init(value_key, obs[:, : self.value_obs_size]) if self.value else {},
-            # With its dtype said: of a weak type, as of a number of Python, whatever is compiled
-            # for the first state would be compiled again for the second.
+            # With an explicit dtype: with a weak type, as of a number of Python, programs that
+            # are compiled for the first state would be compiled again for the second.
             log_std=jnp.full(
                 (self.distribution.action_size,), jnp.log(self.init_noise_std), jnp.float32
             ),

@@ -16,9 +16,9 @@ LAST_LINE_S = 2.0
 class ReportThread:
     """Calls a function in a thread of its own, one call after the other.
 
-    To start an iteration takes the host about as long as the device takes for it. So whoever
-    starts the next one notices too late that this one has ended, and the device would wait while
-    its line is written.
+    To start an iteration takes the host about as long as the device takes for it. So the thread
+    that starts the next one notices too late that this one has ended, and the device would wait
+    while its line is written.
 
     Args:
       report: the function; used by the thread only, until `stop`.
@@ -51,7 +51,7 @@ class ReportThread:
             raise self._error
 
     def give_up(self) -> None:
-        """Says that what the thread waits for will not come: `stop` does not wait for it."""
+        """Marks that what the thread waits for will not come: `stop` does not wait for it."""
         self._is_idle.set()
 
     def stop(self) -> None:

@@ -29,7 +29,7 @@ def save(folder: Path, tree: PyTree) -> None:
     Raises:
       GmijaxError: it cannot be read again.
     """
-    # A checkpoint says nothing of devices.
+    # A checkpoint has nothing of devices.
     plain = jax.tree.map(np.asarray, _storable(tree))
     with _plain_path(folder) as path, ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(path, plain)
@@ -52,7 +52,7 @@ def restore(folder: Path, template: T) -> T:
             saved = _by_name(checkpointer.restore(path))
     except Exception as error:
         # Orbax raises a plain `Exception` for an array that it cannot read. Anything else, such
-        # as a device without enough memory, does not say that the checkpoint is bad.
+        # as a device without enough memory, does not show that the checkpoint is bad.
         if not isinstance(error, ValueError | KeyError | OSError) and type(error) is not Exception:
             raise
         why = lines_of(error)[0]

@@ -55,7 +55,7 @@ def first_state(
     `init` makes the state of a new run, see `Algorithm`.
 
     Raises:
-      ConfigError: the checkpoint to go on from does not fit.
+      ConfigError: the checkpoint to continue from does not fit.
     """
     key = _keys(config.seed)[0]
 
@@ -70,7 +70,7 @@ def first_state(
     state = restore_learner(checkpoint, state)
     # The schedule's rate is part of the state, unless the user asks for another one now.
     wanted, meta = config.algo.learning_rate, CheckpointMeta.read(checkpoint)
-    # A run that goes on in its own folder has written its new configuration by now.
+    # A run that continues in its own folder has written its new configuration by now.
     before = meta.learning_rate
     if before is None:  # Written by an older version.
         before = saved_config(checkpoint)["algo"].get("learning_rate", wanted)
@@ -116,7 +116,7 @@ def first_envs(
       env: the environments.
       config: of the run.
       rank: number of this GMI among those that simulate.
-      gmi: whose environments of a checkpoint to take, None for nobody's.
+      gmi: whose environments of a checkpoint to take, None for no GMI's.
       num_gmis: only from a checkpoint of so many GMIs, None for any.
       num_runs: that share the GMI; all of them have to fit.
 
@@ -152,7 +152,7 @@ def envs_go_on(config: TrainConfig, gmi: int, num_gmis: int | None) -> bool:
 
 
 def replay_goes_on(config: TrainConfig, gmi: int, num_gmis: int) -> bool:
-    """Whether a GMI goes on with the replay of its checkpoint: where its environments go on."""
+    """Whether a GMI continues with the replay of its checkpoint: if its environments do."""
     goes_on = envs_go_on(config, gmi, num_gmis)
     return goes_on and has_replay(Path(str(config.run.resume)), gmi)
 
@@ -190,7 +190,7 @@ def begin_episodes(
     """Environments `first_env` to `first_env + num_envs - 1` of a job at their starts.
 
     `kept_steps` are the steps of all of them whose experience is in memory at once, with
-    `kept_itemsize` bytes for each number of an observation or action; `kept_key` says how many.
+    `kept_itemsize` bytes for each number of an observation or action; `kept_key` sets how many.
     There are `num_runs` times as many environments in memory as this makes.
 
     Raises:

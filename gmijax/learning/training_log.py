@@ -157,7 +157,7 @@ class TrainingLog:
           others: what else is to stand there.
           simulated: how many steps `counts` are of, None for those learnt from.
           now_s: time of the line, None for now.
-          paused_s: seconds after it in which nobody trained; not in the rate of the next line.
+          paused_s: seconds after it without training; not in the rate of the next line.
 
         Raises:
           NonFiniteError: too many steps diverged, or a loss is NaN or infinite.

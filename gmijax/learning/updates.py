@@ -21,7 +21,7 @@ Gradients: TypeAlias = Callable[[Learner, ActorCriticParams, Any, Any, Array], t
 the losses are a named tuple of [] float32, with a property `steering_kl`."""
 
 _ACTION_BOUND = 1.1
-"""Means beyond this are penalised; actions are clipped to 1, and a little room is harmless."""
+"""Means beyond this are penalised; actions are clipped to 1, and a small margin is harmless."""
 
 _SATURATED = 0.999
 """Means beyond this count as saturated; a tanh only comes close to 1."""

@@ -1,7 +1,7 @@
 """Records the walking test in MJX: any policy in one of Playground's joystick tasks.
 
-Each environment has one start, which no training has, and is never reset. What the recording
-says of the policy is computed by `gmijax.player.walking`.
+Each environment has one start, which no training has, and is never reset. The results for the
+policy are computed from the recording by `gmijax.player.walking`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gmijax.compile_once import compile_once
 from gmijax.config import EnvConfig
 from gmijax.errors import ConfigError
 from gmijax.learning.learner import Learner, acting_weights
-from gmijax.learning.memory import require_room
+from gmijax.learning.memory import require_memory
 from gmijax.learning.normalize import normalize
 from gmijax.player.joystick import Ground, Readings, Robot, with_pushes
 from gmijax.player.walking import LENGTH_S, ONE_ACTION, Recording, Walk, measure
@@ -79,7 +79,7 @@ class WalkingTest:
         started_s = time.monotonic()
         model = self._env.model
         state = jax.eval_shape(self._begin, model, self._keys)
-        require_room("walking_envs", len(self._keys), state)
+        require_memory("walking_envs", len(self._keys), state)
         begin = self._begin.lower(model, self._keys)
         chunk = self._chunk.lower(model, weights, state)
         self._begin, self._chunk = compile_once(begin), compile_once(chunk)

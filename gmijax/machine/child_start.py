@@ -1,7 +1,7 @@
 """What a child process runs first: `python -P child_start.py VERSION PATHS MODULE ARGUMENTS...`.
 
 It loads the gmijax that this file is a part of, wherever the path leads, and then MODULE. VERSION
-is that of the parent, which may have been started before another one was installed in its place.
+is that of the parent, which may have been started before another one was installed.
 See `gmijax.machine.interpreter`.
 """
 

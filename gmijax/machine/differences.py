@@ -9,7 +9,7 @@ from gmijax.machine.snapshot import Machine
 
 
 def differences_in(what: str, of_nodes: Mapping[str, str | None]) -> list[str]:
-    """A sentence that says which nodes have which, by name; none if all have the same."""
+    """A sentence with each value and the nodes that have it; none if all have the same."""
     having: dict[str, list[str]] = {}
     for name, value in of_nodes.items():
         having.setdefault(value or "none", []).append(name)

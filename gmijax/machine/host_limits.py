@@ -1,7 +1,7 @@
 """How many GMIs a host takes: cores, memory, threads, open files. Starts nothing, needs no jax.
 
-A GMI is a whole interpreter with jax in it. More of them than there is room for do not fail one
-by one: they take the machine down. So `gmijax.partition.planner` asks here before it plans.
+A GMI is a whole interpreter with jax in it. More of them than the host can run do not fail one by
+one: they take the machine down. So `gmijax.partition.planner` checks these limits before it plans.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def detect_host() -> HostLimits:
     )
 
 
-def require_room(
+def require_host_capacity(
     num_gmis: int, what: str, host: HostLimits, num_cores: int, *, on_cpu: bool
 ) -> None:
     """Raises ConfigError if a job has more GMIs than the host takes; one is always allowed.
@@ -177,26 +177,26 @@ class CgroupLimits:
 def _needs(
     num_gmis: int, host: HostLimits, num_cores: int, *, on_cpu: bool
 ) -> Iterator[tuple[int, str]]:
-    """For how many GMIs each thing is enough, and what to say if that is too few."""
+    """For how many GMIs each resource is enough, and the text if these are too few."""
 
-    def room(available: float, each: float) -> int:
+    def capacity(available: float, each: float) -> int:
         return max(1, int(available // each))
 
     if host.memory_mib is not None:
         each = CPU_GMI_MIB if on_cpu else GPU_GMI_MIB
         text = f"{_gib(num_gmis * each)} of memory (there are {_gib(host.memory_mib)})"
-        yield room(host.memory_mib, each), text
+        yield capacity(host.memory_mib, each), text
     if on_cpu:
-        wanted = math.ceil(num_gmis / GMIS_PER_CORE)
-        text = f"{wanted} CPU cores, one for every {GMIS_PER_CORE} (there are {num_cores})"
+        needed = math.ceil(num_gmis / GMIS_PER_CORE)
+        text = f"{needed} CPU cores, one for every {GMIS_PER_CORE} (there are {num_cores})"
         yield num_cores * GMIS_PER_CORE, text
     if host.threads is not None:
         text = f"{num_gmis * THREADS_OF_A_GMI} threads ({host.threads} may still be started)"
-        yield room(host.threads, THREADS_OF_A_GMI), text
+        yield capacity(host.threads, THREADS_OF_A_GMI), text
     if host.open_files is not None:
-        wanted = FILES_OF_A_JOB + num_gmis * FILES_OF_A_GMI
-        text = f"{wanted} open files ({host.open_files} may still be opened, see ulimit -n)"
-        yield room(host.open_files - FILES_OF_A_JOB, FILES_OF_A_GMI), text
+        needed = FILES_OF_A_JOB + num_gmis * FILES_OF_A_GMI
+        text = f"{needed} open files ({host.open_files} may still be opened, see ulimit -n)"
+        yield capacity(host.open_files - FILES_OF_A_JOB, FILES_OF_A_GMI), text
 
 
 def _gib(mib: float) -> str:
@@ -218,7 +218,7 @@ def _threads_of_user() -> int | None:
 
 
 def _threads_of_machine() -> int | None:
-    """Threads that the kernel has room for."""
+    """Threads that the kernel can still start."""
     with suppress(OSError, ValueError, IndexError):
         kernel = Path("/proc/sys/kernel")
         limits = [int((kernel / name).read_text()) for name in ("pid_max", "threads-max")]

@@ -1,7 +1,7 @@
 """How every child process of gmijax is started: as a module of this very gmijax. Stdlib only.
 
 `python -m` would put the working directory before everything else on the child's path: a file
-`random.py` there would take the place of Python's, and in a checkout the child would be of
+`random.py` there would shadow Python's, and in a checkout the child would be of
 another version than its parent. So a child runs the file `child_start.py` with `-P`.
 """
 
@@ -22,7 +22,7 @@ def command(module: str, *arguments: str) -> list[str]:
 
     The child's path begins as that of any interpreter does: `PYTHONPATH`, Python, installed
     packages. What else this process has on its own, such as the folder of the user's script, comes
-    after all of that, so it takes the place of nothing.
+    after all of that, so it shadows nothing.
 
     Args:
       module: its name.

@@ -48,14 +48,14 @@ def split_commands(gpu: Gpu, wanted: str) -> tuple[str, ...]:
         raise ConfigError(f"mig={wanted}: GPU {gpu.index} ({gpu.name}) has no MIG")
     sizes = _QUARTERS if _FOUR_SLICES.search(gpu.name) else _EIGHTHS
     parts = _parse(wanted, gpu, sizes)
-    places = place_instances(parts, sizes)
-    if places is None:
+    starts = place_instances(parts, sizes)
+    if starts is None:
         raise ConfigError(
             f"mig={wanted}: these instances do not fit side by side on GPU {gpu.index} "
             f"({gpu.name}); whole it is {max(sizes)}g"
         )
     profiles = ",".join(
-        f"{_profile(part, gpu, sizes)}:{start}" for part, start in zip(parts, places, strict=True)
+        f"{_profile(part, gpu, sizes)}:{start}" for part, start in zip(parts, starts, strict=True)
     )
     commands: list[str] = []
     if not gpu.mig_enabled:

@@ -27,7 +27,7 @@ class MigInstance(NamedTuple):
 class Gpu(NamedTuple):
     """A GPU as NVML lists it."""
 
-    index: int  # Place in the list of nvidia-smi.
+    index: int  # In the list of nvidia-smi.
     uuid: str  # `GPU-...`.
     name: str  # Product name.
     memory_mib: int  # Total memory, MiB.
@@ -41,7 +41,7 @@ class Gpu(NamedTuple):
 
 
 class GpuLoad(NamedTuple):
-    """What a GPU does at the moment, whoever uses it.
+    """What a GPU does at the moment, for all its processes.
 
     Attributes:
       used_mib, total_mib: memory.
@@ -77,12 +77,12 @@ def list_gpus() -> tuple[Gpu, ...]:
 
 
 def load_of(device: str) -> GpuLoad | None:
-    """Of the GPU or MIG instance with this UUID; None: NVML does not say."""
+    """Of the GPU or MIG instance with this UUID; None: NVML does not report it."""
     with suppress(pynvml.NVMLError), nvml_session():
         handle = pynvml.nvmlDeviceGetHandleByUUID(device)
         memory = pynvml.nvmlDeviceGetMemoryInfo(handle)
         busy = 1.0
-        with suppress(pynvml.NVMLError):  # NVML does not say it of MIG instances.
+        with suppress(pynvml.NVMLError):  # NVML does not report it for MIG instances.
             busy = int(pynvml.nvmlDeviceGetUtilizationRates(handle).gpu) / 100
         return GpuLoad(int(memory.used) / _MIB, int(memory.total) / _MIB, busy)
     return None
@@ -145,7 +145,7 @@ def _instances(handle: Any) -> tuple[MigInstance, ...]:
     with suppress(pynvml.NVMLError):
         most = pynvml.nvmlDeviceGetMaxMigDeviceCount(handle)
     for index in range(most):
-        # Holes are normal: instances keep their places when others go.
+        # Gaps are normal: instances keep their indices when others are removed.
         with suppress(pynvml.NVMLError):
             found.append(_describe_instance(handle, index))
     return tuple(found)

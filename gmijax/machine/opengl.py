@@ -80,13 +80,13 @@ def why_no_opengl() -> str | None:
 def is_missing(exit_code: int) -> bool:
     """Whether a child of `gmijax.workers.play_film` ended for want of its OpenGL."""
     # A broken driver may end the process with a signal instead of an error. These two come from
-    # somebody else: the user, a batch system, or the machine when it runs out of memory.
+    # outside: the user, a batch system, or the machine when it runs out of memory.
     sent = (-signal.SIGKILL, -signal.SIGTERM)
     return exit_code == EXIT_NO_GL or (exit_code < 0 and exit_code not in sent)
 
 
 def what_is_missing(tried: Sequence[str]) -> str:
-    """Says that none of them works, and what helps."""
+    """The message that none of them works, and what helps."""
     return (
         f"no headless OpenGL (EGL or OSMesa) is to be had, tried {', '.join(tried)}; "
         "install it with `apt-get install libegl1` or `apt-get install libosmesa6`"

@@ -123,7 +123,7 @@ def that_have_open(path: Path) -> dict[int, str]:
 
 
 def names_of(pids: Iterable[int]) -> dict[int, str]:
-    """Numbers and names of those of the processes that have not ended, whoever's they are."""
+    """Numbers and names of those of the processes that have not ended, of any user."""
     found = {}
     for pid in pids:
         with suppress(OSError):

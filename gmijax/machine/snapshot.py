@@ -29,10 +29,10 @@ from gmijax.machine.nvidia import Gpu, driver_version, gpu_problem, list_gpus
 from gmijax.runs.cache import why_temporary
 
 _HIDES_ALL = ("", "-1", "NoDevFiles")
-"""Values of `CUDA_VISIBLE_DEVICES` that say on purpose that there are no GPUs."""
+"""Values of `CUDA_VISIBLE_DEVICES` that hide all GPUs on purpose."""
 
 DAEMONS_VARIABLE = "GMIJAX_MPS_DAEMONS"
-"""Tells a job which MPS daemons its sweep or pack runs for it: JSON, see `Machine.daemons`."""
+"""The MPS daemons that a sweep or pack runs for its jobs: JSON, see `Machine.daemons`."""
 
 _OTHERS = {"kfd": "a GPU for ROCm", "accel[0-9]*": "a TPU"}
 
@@ -47,7 +47,7 @@ class Machine:
         more than its control group gets time for.
       mps_control: program of the MPS daemon, None where it is not installed.
       driver_version: of the NVIDIA driver, None without one.
-      operator_daemon: pipe directory of a running MPS daemon that somebody else started.
+      operator_daemon: pipe directory of a running MPS daemon that gmijax did not start.
       daemons: the same for a job of a sweep or pack, by UUID of the GPU or MIG instance.
       host: what is left of memory, threads and open files.
       gpu_problem: why there are no GPUs although NVIDIA's driver is there; None where it works,
@@ -104,7 +104,7 @@ def detect_machine() -> Machine:
     gpus = visible_gpus(listed, selection)
     is_hidden = selection is not None and selection.strip() in _HIDES_ALL
     mps_control = find_mps_control() if gpus else None
-    daemon, stranger = _operator_daemon(mps_control) if mps_control else (None, None)
+    daemon, daemon_warning = _operator_daemon(mps_control) if mps_control else (None, None)
     return Machine(
         gpus=gpus,
         cpu_cores=usable_cores(cores, CgroupLimits().cpu_quota(), platform.node()),
@@ -117,7 +117,7 @@ def detect_machine() -> Machine:
         selection_problem=_selection_problem(listed, selection),
         warnings=(
             *(() if gpus else _other_accelerators()),
-            *filter(None, (stranger, why_temporary(), _left_out_of_gmis())),
+            *filter(None, (daemon_warning, why_temporary(), _left_out_of_gmis())),
         ),
     )
 
@@ -146,7 +146,7 @@ def visible_gpus(gpus: tuple[Gpu, ...], selection: str | None) -> tuple[Gpu, ...
 
 
 def _selection(daemons: Mapping[str, Path]) -> str | None:
-    """`CUDA_VISIBLE_DEVICES`, with UUIDs in place of numbers in a job of a pack.
+    """`CUDA_VISIBLE_DEVICES`, with UUIDs instead of numbers in a job of a pack.
 
     A daemon numbers its GPUs from 0 and its clients see those numbers, not those of nvidia-smi.
     """
@@ -156,7 +156,7 @@ def _selection(daemons: Mapping[str, Path]) -> str | None:
 
 
 def _selection_problem(gpus: tuple[Gpu, ...], selection: str | None) -> str | None:
-    """Why a selection is none of these GPUs, as CUDA does not say; None where there are none."""
+    """Why a selection is none of these GPUs, which CUDA does not report; None without one."""
     if selection is None or not gpus:
         return None
     for entry in _entries(selection):
@@ -191,23 +191,23 @@ def _named_part(gpu: Gpu, entry: str) -> Gpu | None:
 
 
 def _operator_daemon(program: Path) -> tuple[Path | None, str | None]:
-    """The pipe directory of a daemon that runs, or why the one that is there is left alone."""
+    """The pipe directory of a daemon that runs, or a warning why the one there is not used."""
     named = os.environ.get(PIPE_VARIABLE)
     directory = Path(named) if named else DEFAULT_PIPE_DIRECTORY
     # Asking where there is no directory would cost a process start on every run. Unlike
     # `Path.is_dir` this takes any text, and folders of others.
     if not os.path.isdir(directory):
         return None, None
-    if not named and (owner := strange_owner(directory)) is not None:
+    if not named and (owner := foreign_owner(directory)) is not None:
         return None, (
             f"warning: {directory} belongs to user {owner}, so the MPS daemon there is not used; "
-            f"{PIPE_VARIABLE}={directory} says that it is to be"
+            f"set {PIPE_VARIABLE}={directory} to use it"
         )
     return (directory if MpsControl(program, directory).is_answering() else None), None
 
 
 def _given_daemons() -> dict[str, Path]:
-    """What `DAEMONS_VARIABLE` says; nothing if it is not valid."""
+    """The daemons in `DAEMONS_VARIABLE`; none if it is not valid."""
     with suppress(ValueError):
         given = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
         if isinstance(given, dict):
@@ -225,12 +225,14 @@ def _answering(program: Path, daemons: Mapping[str, Path]) -> dict[str, Path]:
 
 def _left_out_of_gmis() -> str | None:
     """What a user has set for other programs that use jax."""
-    found = ", ".join(f"{key}={value}" for key, value in breaking(os.environ).items())
-    return f"warning: GMIs start without {found}, with which tasks do not work" if found else None
+    settings = ", ".join(f"{key}={value}" for key, value in breaking(os.environ).items())
+    if not settings:
+        return None
+    return f"warning: GMIs start without {settings}, with which tasks do not work"
 
 
-def strange_owner(directory: Path) -> int | None:
-    """Who owns a directory that everybody could have made; None if root or this user does."""
+def foreign_owner(directory: Path) -> int | None:
+    """The owner of a directory that any user could have made; None if root or this user is."""
     owners = (directory.lstat().st_uid, directory.stat().st_uid)
     return next((owner for owner in owners if owner not in (0, os.geteuid())), None)
 

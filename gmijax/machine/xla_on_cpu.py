@@ -17,7 +17,7 @@ _FUSION_EMITTERS = "--xla_cpu_use_fusion_emitters"
 """Physics of long kinematic chains runs up to a thousand times slower with them."""
 
 _FIRST_JAXLIB_WITHOUT_FLAG = (0, 11, 1)
-"""From here on XLA ends the process when it meets the flag, as with any unknown one."""
+"""From this version on XLA ends the process if the flag is set, as with any unknown one."""
 
 
 def flags_on_cpu(users_flags: str) -> str:

@@ -103,7 +103,7 @@ class CommandKind:
         run, log = self._paths.job(number), self._paths.log(number)
         run_dir = self._paths.run_dir(number)
         run.root.mkdir(parents=True, exist_ok=True)
-        # Before its first report it has saved nothing that it could go on from.
+        # Before its first report it has saved nothing that it could continue from.
         may_resume = settings.resume is not None and run.metrics.exists()
         resumes = may_resume and number not in self._from_nothing
         if not resumes:
@@ -205,7 +205,7 @@ class CommandKind:
             alone = self._is_suspect(running, job)
             again = None if alone else "beside others: the fault may be that of another one"
         elif attempt.resumes and not job.progress.reports and not alone:
-            # It had saved nothing yet: there is nothing to go on from.
+            # It had saved nothing yet: there is nothing to continue from.
             self._from_nothing.add(job.number)
             again = "from its beginning"
         return JobOutcome(
@@ -258,7 +258,7 @@ class _Attempt:
     Attributes:
       silence: of its log.
       begins: byte of its log where what it prints begins.
-      resumes: whether it was asked to go on from a checkpoint of its own.
+      resumes: whether it was asked to continue from a checkpoint of its own.
       is_client: whether it was seen to have its share of the GPU.
       client_asked_s: when that was asked; None: not yet.
     """

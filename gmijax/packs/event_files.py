@@ -23,7 +23,7 @@ _MOST_BYTES: Final = 1 << 24
 _LONGEST_BYTES: Final = 1 << 31
 """Of one record, as of any protobuf message. A file with a longer one is damaged."""
 _DAMAGED: Final = 1 << 63
-"""In place of where to read on: further than any file is long."""
+"""An offset for "do not read on": beyond the end of any file."""
 
 
 class EventReader:

@@ -16,14 +16,14 @@ _OUT_OF_MEMORY: Final = re.compile(
     r"|RESOURCE_EXHAUSTED|CUDA_ERROR_OUT_OF_MEMORY|Failed to allocate \d+ bytes on device 'cuda"
     r"|Warp CUDA error 2\b|OOM when allocating tensor|CUDA_ERROR_MPS_MAX_CLIENTS_REACHED"
 )
-"""What PyTorch, cuBLAS, XLA, Warp, TensorFlow, CuPy and MPS say. Only read after a failure: XLA
-says it in healthy runs too, where it can do with less."""
+"""Messages of PyTorch, cuBLAS, XLA, Warp, TensorFlow, CuPy and MPS. Only read after a failure: XLA
+prints its own in healthy runs too, where it can do with less."""
 
 _GPU_FAULT: Final = re.compile(
     r"unspecified launch failure|illegal memory access|misaligned address|CUDA_ERROR_MPS_"
     r"|Warp CUDA error (?!2\b)\d+|CUDA error: (?!out of memory)"
 )
-"""A fatal fault of one MPS client is reported to all, and CUDA does not say whose it was."""
+"""A fatal fault of one MPS client is reported to all, and CUDA does not report whose it was."""
 
 
 class Failure(NamedTuple):

@@ -37,7 +37,7 @@ class OutputReader:
         try:
             with self._path.open("rb") as file:
                 size = os.fstat(file.fileno()).st_size
-                if size < self._offset:  # Somebody has cut it.
+                if size < self._offset:  # It was truncated.
                     self._offset, self._rest = 0, b""
                 if size - self._offset > _MOST_BYTES:
                     self._offset, self._rest = size - _MOST_BYTES, b""

@@ -49,8 +49,8 @@ class PackWork(Work[CommandJob]):
     """Commands; see `Work`.
 
     Attributes:
-      limiters: what limits the slots of a run, once it has begun: the report is made before, and
-        tells its decisions. The only thing here that changes.
+      limiters: what limits the slots of a run, once it has begun: the report, which is made
+        before, lists their decisions. The only attribute that changes.
     """
 
     name = "pack"
@@ -304,12 +304,13 @@ def _listed(key: str, values: Iterable[Any], most: int | None = None) -> tuple[A
     return found
 
 
-def _with_own_backends(said: str) -> str:
-    """What a planner says, without backends that `pack.backend` does not take."""
-    said = said.replace("plan.backend=cpu (or CUDA_VISIBLE_DEVICES=-1)", "CUDA_VISIBLE_DEVICES=-1")
-    said = said.replace(" (any number is allowed with plan.backend=cpu)", "")
-    said = said.replace("use plan.backend=mig, or choose", "choose")
-    said, here, names = said.partition("; available here: ")
+def _with_own_backends(error: str) -> str:
+    """The error of a planner, without backends that `pack.backend` does not take."""
+    cpu = "plan.backend=cpu (or CUDA_VISIBLE_DEVICES=-1)"
+    error = error.replace(cpu, "CUDA_VISIBLE_DEVICES=-1")
+    error = error.replace(" (any number is allowed with plan.backend=cpu)", "")
+    error = error.replace("use plan.backend=mig, or choose", "choose")
+    error, here, names = error.partition("; available here: ")
     own = typing.get_args(typing.get_type_hints(PackConfig)["backend"])
     kept = ", ".join(name for name in names.split(", ") if name in own)
-    return f"{said}{here}{kept}".replace("plan.backend", "pack.backend")
+    return f"{error}{here}{kept}".replace("plan.backend", "pack.backend")

@@ -34,7 +34,7 @@ class OwnPatterns(NamedTuple):
     patterns: Mapping[str, re.Pattern[str]]
 
     def read(self, line: str) -> Report | None:
-        """What a line says; None: nothing."""
+        """The progress in a line; None: it has none."""
         found = {key: pattern.search(line) for key, pattern in self.patterns.items()}
         return report_of({key: match[1] for key, match in found.items() if match})
 

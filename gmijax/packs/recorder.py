@@ -32,7 +32,7 @@ class Recorder:
         is_first, self._is_first = self._is_first, False
         with suppress(OSError):  # A full disk must not end the pack.
             if is_first and self._metrics.exists():
-                # An attempt that goes on from a checkpoint repeats some steps, or counts anew.
+                # An attempt that continues from a checkpoint repeats some steps, or counts anew.
                 copy_history(self._metrics, self._metrics, lines[0]["env_steps"] - 1)
             with self._metrics.open("a") as file:
                 file.writelines(json.dumps(line) + "\n" for line in lines)

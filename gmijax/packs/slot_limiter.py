@@ -32,7 +32,7 @@ _SILENT_S: Final = 180.0
 """How long a first job may run without a report until it counts as one that makes none."""
 
 _IDLE: Final = 0.6
-"""A GPU that is busy less often has room for a second job that reports nothing."""
+"""A GPU that is busy less often can take a second job that reports nothing."""
 
 
 class SlotLimiter:

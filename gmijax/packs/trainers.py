@@ -14,7 +14,7 @@ _NUMBER: Final = r"(-?(?:\d[\d.]*(?:e[+-]?\d+)?|nan|inf))"
 
 
 class Report(NamedTuple):
-    """What a line says; None where it says nothing of it.
+    """The values in a line; None for those that it does not have.
 
     Attributes:
       steps: of environments, so far.
@@ -37,7 +37,7 @@ class Family(NamedTuple):
       patterns: regular expressions with groups `steps`, `total`, `rate` and `metric`.
       is_average: whether the printed rate is that since the start, not that of the moment.
       is_weak: whether programs that are no trainers print so too; another family that fits
-        later takes its place.
+        later replaces it.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Family(NamedTuple):
     is_weak: bool = False
 
     def read(self, line: str) -> Report | None:
-        """What a line says; None: nothing."""
+        """The values in a line; None: it has none."""
         for pattern in self.patterns:
             if match := pattern.search(line):
                 return report_of(match.groupdict())
@@ -54,7 +54,7 @@ class Family(NamedTuple):
 
 
 def report_of(found: Mapping[str, str | None]) -> Report | None:
-    """What texts say that should be numbers; None: nothing."""
+    """The values of texts that are numbers; None: none is."""
     numbers: dict[str, float] = {}
     for key, text in found.items():
         with suppress(ValueError):  # `12.5.` at the end of a sentence, or `n/a`.

@@ -26,11 +26,11 @@ _AMPERE: Final = 8
 def choose_backend(
     plan: PlanConfig, layout: Layout, machine: Machine, *, serves: bool
 ) -> tuple[BackendName, str]:
-    """The backend for `plan.backend=auto`, and why, in words; `serves`: nobody trains.
+    """The backend for `plan.backend=auto`, and why, in words; `serves`: no GMI trains.
 
     Raises:
-      BackendUnavailable: the driver is broken, or GPUs are named that are not here. Who has GPUs
-        does not want to go on without them unless that is said.
+      BackendUnavailable: the driver is broken, or GPUs are named that are not here: a job on a
+        machine with GPUs runs without them only if that is requested.
     """
     _require_named_gpus(machine)
     if machine.gpu_problem is not None:

@@ -96,7 +96,7 @@ class Layout:
 
     @property
     def gmis_of_node(self) -> tuple[tuple[int, ...], ...]:
-        """GMI ids of every node in order; the place of an id is its rank in the node."""
+        """GMI ids of every node in order; the index of an id is its rank in the node."""
         each = self.num_gpus // self.num_nodes
         nodes = (
             self.gmis_of_gpu[node * each : (node + 1) * each] for node in range(self.num_nodes)
@@ -108,7 +108,7 @@ class Layout:
         return self.gpu_of(gmi) * self.num_nodes // self.num_gpus
 
     def of_node(self, node: int) -> Layout:
-        """The layout of one node, with ranks in the node in place of ids."""
+        """The layout of one node, with ranks in the node instead of ids."""
         each, ids = self.num_gpus // self.num_nodes, self.gmis_of_node[node]
         gpus = self.gmis_of_gpu[node * each : (node + 1) * each]
         return Layout(tuple(tuple(ids.index(gmi) for gmi in gmis) for gmis in gpus))

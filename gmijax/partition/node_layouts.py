@@ -22,7 +22,7 @@ class NodeLayout(NamedTuple):
     Attributes:
       name: address of a node; None in a job on one machine.
       machine: what it has.
-      layout: of its GMIs, with ranks in the node in place of ids.
+      layout: of its GMIs, with ranks in the node instead of ids.
       gmis: their ids, in order.
     """
 
@@ -33,7 +33,7 @@ class NodeLayout(NamedTuple):
 
     @contextmanager
     def named(self) -> Iterator[None]:
-        """Puts the node before what an error says."""
+        """Puts the node before the message of an error."""
         try:
             yield
         except ConfigError as error:

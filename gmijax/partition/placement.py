@@ -19,7 +19,7 @@ _TRAINING_SHARE = 4
 class Placement(NamedTuple):
     """Which GMIs an asynchronous job has."""
 
-    plan: PlanConfig  # The user's wishes with GPUs and layout written out.
+    plan: PlanConfig  # What the user requested, with GPUs and layout written out.
     trainers: tuple[int, ...]  # Ids of the GMIs that train.
     reason: str  # What was decided, in words.
 
@@ -35,7 +35,7 @@ def place(plan: PlanConfig, num_nodes: int = 1) -> Placement:
     them one GPU does both, and of several the last quarter (at least one) trains.
 
     Raises:
-      ConfigError: no serving or no training GMI, or wishes that contradict each other.
+      ConfigError: no serving or no training GMI, or settings that contradict each other.
     """
     if plan.layout is not None:
         raise ConfigError(
@@ -82,7 +82,7 @@ def most_gmis_of_a_node(plan: PlanConfig, num_nodes: int) -> int:
 
 
 def on_fewer_nodes(plan: PlanConfig, before: int, num_nodes: int) -> PlanConfig:
-    """The wishes for as many nodes as are left, where all of them did the same.
+    """The requested plan for as many nodes as are left, where all of them did the same.
 
     Raises:
       ConfigError: indices of GPUs that differ from node to node.

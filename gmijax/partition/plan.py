@@ -107,7 +107,7 @@ class Plan:
         return data
 
     def nodes_data(self) -> list[dict[str, Any]]:
-        """Address and GMIs of every node; the place of a GMI in the list is its rank there."""
+        """Address and GMIs of every node; the index of a GMI in the list is its rank there."""
         pairs = zip(self.nodes, self.layout.gmis_of_node, strict=False)
         return [{"address": address, "gmis": list(gmis)} for address, gmis in pairs]
 

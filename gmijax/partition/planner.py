@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from gmijax.config import BackendName, PlanConfig, ReduceConfig, TemplateName
 from gmijax.errors import ConfigError
-from gmijax.machine.host_limits import require_room
+from gmijax.machine.host_limits import require_host_capacity
 from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import choose_backend, choose_gpus, require_backend
@@ -94,7 +94,7 @@ def make_plan(
 def require_host(num_gmis: int, what: str, plan: PlanConfig, machine: Machine) -> None:
     """Raises ConfigError if a job, by its settings `what`, has more GMIs than the host takes."""
     on_cpu = plan.backend == "cpu" or not machine.gpus
-    require_room(num_gmis, what, machine.host, len(machine.cpu_cores), on_cpu=on_cpu)
+    require_host_capacity(num_gmis, what, machine.host, len(machine.cpu_cores), on_cpu=on_cpu)
 
 
 def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:
@@ -120,15 +120,15 @@ def _allocations(
     num_gpus = 0
     for number, node in enumerate(of_nodes):
         here, gpus = node.layout, ()
-        said = [] if number else reasons  # What is said of all is said once.
+        notes = [] if number else reasons  # Reasons that hold for all nodes are given once.
         with node.named():
             if node.name is not None:
                 what = f"cluster.nodes={len(of_nodes)}"
                 require_host(here.num_gmis, what, plan, node.machine)
             if backend != "cpu":
-                gpus = choose_gpus(plan, here, node.machine, backend, said)
-            shares = make_allocations(plan, here, gpus, backend, node.machine, said)
-        for allocation in shares:
+                gpus = choose_gpus(plan, here, node.machine, backend, notes)
+            of_node = make_allocations(plan, here, gpus, backend, node.machine, notes)
+        for allocation in of_node:
             gmi, gpu = node.gmis[allocation.gmi], allocation.gpu + num_gpus
             allocations[gmi] = dataclasses.replace(allocation, gmi=gmi, gpu=gpu)
         chosen += gpus
@@ -184,7 +184,7 @@ def _self_check(
 ) -> bool:
     if plan.self_check != "auto":
         return plan.self_check == "on"
-    # A daemon of somebody else may cap all its clients by default, and does not say so.
+    # An existing daemon may cap all its clients by default, and does not report it.
     # In a job of a pack the pack's daemon counts as one of these; that costs a matrix product.
     is_theirs = backend == "mps" and any(node.machine.operator_daemon for node in of_nodes)
     return is_theirs or any((allocation.sm_percent or 100.0) < 100.0 for allocation in allocations)

@@ -64,7 +64,7 @@ def why_not_strategy(strategy: str, layout: Layout) -> str | None:
     """None if `strategy` can run on `layout`, else the reason in words."""
     if layout.num_nodes == 1 or strategy in ("none", "flat"):
         return STRATEGIES[strategy].why_not(layout)  # One ring may go over all nodes.
-    # It is what each node does inside; `inter` says how nodes exchange, whatever that is.
+    # It is what each node does inside; `inter` is how nodes exchange, whatever that is.
     reason = STRATEGIES[strategy].why_not(layout.of_node(0))
     return reason and f"in each node {reason}"
 

@@ -41,7 +41,7 @@ def make_allocations(
 
     Raises:
       ConfigError: a share that the backend cannot enforce, that is not safe, or is not one for
-        each GMI; more GMIs on a GPU than MPS has room for.
+        each GMI; more GMIs on a GPU than MPS allows.
     """
     caps = _sm_percents(plan, layout, gpus, backend, reasons)
     if backend == "cpu":
@@ -61,7 +61,7 @@ def make_allocations(
             round(DEFAULT_MEMORY_FRACTION / sharing[binding.memory], 4) for binding in bindings
         ]
     if backend in ("mps", "mig"):
-        _require_room_for_clients(bindings, machine)
+        _require_client_limit(bindings, machine)
     return tuple(
         Allocation(gmi, layout.gpu_of(gmi), binding.device, caps[gmi], memory[gmi], ())
         for gmi, binding in enumerate(bindings)
@@ -82,10 +82,10 @@ def is_clean(sm_percent: float) -> bool:
 
 
 def assign_instances(num_sms: Sequence[int], num_gmis: int) -> tuple[int, ...]:
-    """Places in `num_sms` (SMs of the instances of a GPU) of its GMIs, in order.
+    """Indices into `num_sms` (SMs of the instances of a GPU) of its GMIs, in order.
 
     Every GMI gets an instance of its own while there are any, the largest first. Each further
-    one goes where it leaves most SMs to each GMI.
+    one goes to the instance where most SMs are left for each GMI.
     """
     load = [0] * len(num_sms)
     chosen: list[int] = []
@@ -147,7 +147,7 @@ def _bindings_of(layout: Layout, gpus: Sequence[Gpu], backend: BackendName) -> l
     return [bindings[gmi] for gmi in layout.gmis]
 
 
-def _require_room_for_clients(bindings: Sequence[_Binding], machine: Machine) -> None:
+def _require_client_limit(bindings: Sequence[_Binding], machine: Machine) -> None:
     new = machine.driver_major >= _NEW_DRIVER
     whole = _CLIENTS_OF_NEW_DRIVERS if new else _CLIENTS_OF_OLD_DRIVERS
     for (_, profile), most in Counter(

@@ -45,8 +45,8 @@ class Group(NamedTuple):
     """The GMIs of a layout that have a role, as ranks of their own."""
 
     gmis: tuple[int, ...]  # Their ids in order; a GMI's rank in the group is its position here.
-    # Where they are, with ranks in place of ids; GPUs and nodes without one of them are left out.
-    # Its nodes are those only if these are alike: who reduces asks for that.
+    # Where they are, with ranks instead of ids; GPUs and nodes without one of them are left out.
+    # Its nodes are right only if all have the same layout, which a reduction requires.
     layout: Layout
 
 
@@ -91,7 +91,7 @@ def has_role(roles: str, role: str) -> bool:
 
 
 def group_of(layout: Layout, roles: Iterable[str], role: str) -> Group | None:
-    """The GMIs whose roles include `role`, None if nobody has it."""
+    """The GMIs whose roles include `role`, None if no GMI has it."""
     gmis = tuple(gmi for gmi, theirs in enumerate(roles) if has_role(theirs, role))
     if not gmis:
         return None

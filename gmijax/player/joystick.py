@@ -40,10 +40,10 @@ class Robot(NamedTuple):
       redrawn_steps: control steps after which a new command is drawn; None: at random times.
       gait_hz: range of the frequency of the gait's clock; None: the robot has none.
       zero_command_phase_rad: what the two legs' phases are set to while the command is zero; they
-        go on from there. None: the clock goes on as ever.
-      up_sensor: z axis of a part of the body, by which the task says that the robot has fallen:
+        continue from there. None: the clock is not changed.
+      up_sensor: z axis of a part of the body, by which the task detects that the robot has fallen:
       least_up: if its z is less than this.
-      touch_sensors: contacts by which it says so too.
+      touch_sensors: contacts by which it detects that too.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What episodes came to, and how `returns.json` says it. No jax here."""
+"""The outcome of episodes, and its form in `returns.json`. No jax here."""
 
 from __future__ import annotations
 

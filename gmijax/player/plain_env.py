@@ -69,7 +69,7 @@ class PlainEnv:
         self._env = _plain_task(config)
         self.physics: CPhysics = self._env.model
         self._task, self._settings = str(config.name), config.settings
-        self._rng: Any = np.random.default_rng(seed)  # In the place of a key.
+        self._rng: Any = np.random.default_rng(seed)  # Instead of a key.
         self.state: EnvState
         self._diverged = False
         self.reset()
@@ -111,7 +111,7 @@ class PlainEnv:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """What the episode has come to by now, by the names of `spec.metrics`."""
+        """What the episode has reached by now, by the names of `spec.metrics`."""
         return {name: float(value) for name, value in self.state.metrics.items()}
 
     @property
@@ -175,7 +175,7 @@ def task_of(policy: PlainPolicy) -> EnvConfig:
     """The task that a policy was trained for.
 
     Raises:
-      ConfigError: the policy does not say, or its keys are none of this version.
+      ConfigError: the policy has no task, or its keys are none of this version.
     """
     saved = policy.about.get("env")
     if not isinstance(saved, dict):

@@ -22,7 +22,7 @@ class Played(NamedTuple):
       qpos: [L + 1, nq] positions from the start on.
       return_: the sum of its rewards.
       terms: what every term added to it.
-      metrics: what it had come to at its end.
+      metrics: what it had reached at its end.
       terminated: it ended by itself.
       truncated: time ran out.
       diverged: it ended because of a bad number.

@@ -22,7 +22,7 @@ Flags: TypeAlias = npt.NDArray[Any]
 LENGTH_S: Final = 20.0
 NUM_ENVS: Final = 1000
 ONE_ACTION: Final = "the walking test takes 1 only"
-"""What is said of another `env.action_repeat`."""
+"""The error for another `env.action_repeat`."""
 SETTLING_S: Final = 0.5
 """After the start, a new command and a push errors do not count in `settled`."""
 
@@ -32,7 +32,7 @@ LEAST_UPRIGHT: Final = 0.99
 MOST_LINEAR_ERROR_M_PER_S: Final = 0.25
 MOST_YAW_ERROR_RAD_PER_S: Final = 0.25
 MOST_LEFT: Final = 0.5
-"""Most of the environments that may leave the field: the others say how the policy walks."""
+"""Most of the environments that may leave the field: the others show how the policy walks."""
 
 LEAST_ENVS: Final = 100
 """With fewer environments 99 % cannot be distinguished from less, and the test does not decide."""
@@ -76,7 +76,7 @@ class Walk(NamedTuple):
     """What the test found.
 
     Attributes:
-      walks: whether it meets all marks; None of fewer than `LEAST_ENVS` environments.
+      walks: whether it passes all criteria; None of fewer than `LEAST_ENVS` environments.
       num_envs: N.
       length_s: seconds that an environment is watched for.
       upright: share that does not fall, of those that do not leave the field; None if all leave.

@@ -1,7 +1,7 @@
 """Mean and sum of nested data over some ranks, by messages between them.
 
 Each rank adds up one part of the numbers, in order of rank, and sends the result to all: the
-result is bit-identical. Small data go to everybody at once, which saves one of the two journeys.
+result is bit-identical. Small data go to all ranks at once, which saves one of the two steps.
 
 This takes any data and any group. The mean of many float32 over all ranks goes through the shared
 block of the host, which is faster; it takes one length, that of the first such call.
@@ -25,7 +25,7 @@ from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError
 Operation = Literal["mean", "sum"]
 
 AT_ONCE_BYTES: Final = 16384
-"""Up to this size numbers go to everybody at once."""
+"""Up to this size numbers go to all ranks at once."""
 
 
 class _Call(NamedTuple):

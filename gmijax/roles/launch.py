@@ -16,7 +16,7 @@ from gmijax.channels.messenger import MIN_CAPACITY_BYTES
 from gmijax.config import Timeouts
 from gmijax.config.schema import require_between, require_positive
 from gmijax.errors import ConfigError, GmiFailed, GmijaxError
-from gmijax.machine.host_limits import require_room
+from gmijax.machine.host_limits import require_host_capacity
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.roles import shipping
@@ -77,7 +77,7 @@ def launch(
     roles = _roles(role, plan)
     _check_numbers(timeout_s, pipe_mib, start_timeout_s, stall_timeout_s, grace_s)
     machine = detect_machine()
-    _require_room(plan, machine)
+    _require_capacity(plan, machine)
     config = {
         "roles": [type(each).__qualname__ for each in roles],
         "timeout_s": timeout_s,
@@ -144,10 +144,10 @@ def _plan(plan: Plan | GMIManager) -> Plan:
     return made
 
 
-def _require_room(plan: Plan, machine: Machine) -> None:
-    """The plan may come from another machine, or from a time when there was more room here."""
+def _require_capacity(plan: Plan, machine: Machine) -> None:
+    """The plan may come from another machine, or from a time when more memory was free here."""
     num_cores, on_cpu = len(machine.cpu_cores), plan.backend == "cpu"
-    require_room(plan.layout.num_gmis, "plan", machine.host, num_cores, on_cpu=on_cpu)
+    require_host_capacity(plan.layout.num_gmis, "plan", machine.host, num_cores, on_cpu=on_cpu)
 
 
 def _job(

@@ -34,8 +34,8 @@ def plan(
       gpus: number of GPUs, or their indices as nvidia-smi lists them. Without a GPU here they
         are virtual: groups of processes.
       gmis_per_gpu: GMIs on each of them.
-      layout: ids of the GMIs of every GPU, e.g. `[[0, 1], [2]]`, in place of the two.
-      backend: how a GMI gets its share; `auto` decides, `Plan.reasons` says why.
+      layout: ids of the GMIs of every GPU, e.g. `[[0, 1], [2]]`, instead of the two.
+      backend: how a GMI gets its share; `auto` decides, `Plan.reasons` has the reason.
       sm_percent: cap on the SMs of every GMI in percent (mps), or one for each; None for no cap.
       memory_fraction: part of a GPU's memory for every GMI, or one for each; None: 0.8 split
         evenly.
@@ -166,7 +166,7 @@ class GMIManager:
         return here("allreduce").reduce(data, op, group)
 
     def send(self, data: Any, dst: int) -> None:
-        """In a GMI: sends `data` to GMI `dst` and goes on, see `Role.send`."""
+        """In a GMI: sends `data` to GMI `dst` without waiting, see `Role.send`."""
         here("send").send(data, dst)
 
     def recv(self, src: int, timeout_s: float | None = None) -> Any:

@@ -143,7 +143,7 @@ class Role(ABC):
         return here("collective").reduce(data, op, group)
 
     def send(self, data: Any, dst: int) -> None:
-        """Sends `data` to GMI `dst` and goes on; `data` may be changed at once.
+        """Sends `data` to GMI `dst` without waiting; `data` may be changed at once.
 
         Args:
           data: anything that can be pickled; arrays (of any size) travel as raw bytes, and those

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 _DRAIN_S = 1.0
-"""After so long a GMI that only waits for others to receive says that it is alive."""
+"""After so long a GMI that only waits for others to receive sends a heartbeat."""
 
 
 def _run(link: ChildLink) -> dict[str, Any]:

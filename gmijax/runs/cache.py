@@ -31,16 +31,16 @@ def cache_folder() -> Path:
 
 
 def compilation_cache_dir() -> Path:
-    """Where compiled programs stay between runs, unless JAX_COMPILATION_CACHE_DIR says else."""
+    """Where compiled programs stay between runs, unless JAX_COMPILATION_CACHE_DIR is set."""
     return cache_folder() / "xla"
 
 
 def drop_broken_programs(cache: Path, logs: Iterable[Path]) -> None:
     """Removes entries of programs that GMIs could not read, so that the next job writes them.
 
-    JAX writes an entry in place and never over one that is there: a process that is killed
-    meanwhile, or a full disk, leaves half an entry for every later job. `logs` are what GMIs wrote
-    to stderr. Goes with them: good entries of these programs.
+    JAX writes an entry under its final name, and never over one that is there: a process that is
+    killed meanwhile, or a full disk, leaves half an entry for every later job. `logs` are what
+    GMIs wrote to stderr. Good entries of these programs are removed too.
     """
     names: set[str] = set()
     for log in logs:
@@ -53,12 +53,12 @@ def drop_broken_programs(cache: Path, logs: Iterable[Path]) -> None:
 
 
 def why_temporary() -> str | None:
-    """Says that the cache is a temporary folder, None where it is the user's."""
+    """A warning that the cache is a temporary folder, None where it is the user's."""
     if _of_user() is not None:
         return None
     return (
         f"warning: no home folder that can be written, so compiled programs and profiles are kept "
-        f"in {_temporary()}; XDG_CACHE_HOME says where else"
+        f"in {_temporary()}; set XDG_CACHE_HOME to keep them elsewhere"
     )
 
 

@@ -1,4 +1,4 @@
-"""A checkpoint of a run: its folder, what it says of itself, and whether it is whole."""
+"""A checkpoint of a run: its folder, its meta data, and whether it is whole."""
 
 from __future__ import annotations
 
@@ -101,14 +101,14 @@ class NewestCheckpoint(NamedTuple):
 
 
 def passed_over(checkpoint: Path, wrong: str) -> str:
-    """Says that a checkpoint is not used, and what is wrong with it."""
+    """The message that a checkpoint is not used, and what is wrong with it."""
     return f"checkpoint {nearby(checkpoint)}: passed over, {wrong}"
 
 
 def checkpoints_of(folder: Path) -> list[Path]:
     """The checkpoints of a run folder, whole or not, the fewest steps first.
 
-    What has another name than gmijax gives is somebody's copy, and none of them.
+    What has another name than gmijax gives is a user's copy, and none of them.
     """
     found = by_steps(RunPaths(folder).checkpoints)
     return [path for path in found if os.path.lexists(path / META)]
@@ -136,7 +136,7 @@ def newest_checkpoint(folder: Path) -> NewestCheckpoint:
 
 
 def none_is_whole(found: NewestCheckpoint) -> str:
-    """Says that no checkpoint is whole, and what is wrong with the newest of those there are."""
+    """The message that no checkpoint is whole, and what is wrong with the newest one."""
     (newest, wrong), *others = found.broken
     more = f" (and {len(others)} more)" if others else ""
     return f"no checkpoint is whole: {nearby(newest)}: {wrong}{more}"

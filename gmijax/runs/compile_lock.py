@@ -2,8 +2,8 @@
 
 Every program has a file in the cache that its compiler holds by `flock`. The kernel releases it
 when the process ends, however it ends. Once it is compiled the file names its entries in the
-cache. While these are there nobody takes the lock, so that all load at the same time. Whoever has
-waited in vain compiles beside the others: the compiler was killed, or the disk is full.
+cache. While these are there no process takes the lock, so that all load at the same time. One that
+has waited in vain compiles beside the others: the compiler was killed, or the disk is full.
 """
 
 from __future__ import annotations

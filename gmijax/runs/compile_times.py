@@ -1,4 +1,4 @@
-"""How long compiling took here before, for whoever waits for it again."""
+"""How long compiling took here before, for the display while it is awaited again."""
 
 from __future__ import annotations
 

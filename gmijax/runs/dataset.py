@@ -4,8 +4,8 @@
 `<output.dir>/gmi_000/000000.{npz,json} 000001.{npz,json} ...`
 
 A folder for every GMI that simulates, by its rank among them; a shard is one unroll: arrays
-[T, N, ...] and, written after them, a JSON file that says what they are. A shard without its JSON
-file, or of another size than it says, is unfinished and is made again.
+[T, N, ...] and, written after them, a JSON file that describes them. A shard without its JSON
+file, or of another size than it has there, is unfinished and is made again.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class DataPaths:
 
     def finished(self) -> Iterator[ShardPaths]:
         """All finished shards, GMI by GMI."""
-        # Not a copy that somebody made, e.g. gmi_000.bak or gmi_0.
+        # Not a copy that a user made, e.g. gmi_000.bak or gmi_0.
         names = (re.fullmatch("gmi_([0-9]{3,})", path.name) for path in self.root.glob("gmi_*"))
         for rank in sorted({int(name[1]) for name in names if name}):
             for index in range(self.num_finished(rank)):

@@ -25,7 +25,7 @@ META = "meta.json"
 """Written last into a checkpoint: a folder without it is not one."""
 
 POLICY = "policy.npz"
-"""The policy of a checkpoint, for who has no jax; those of older versions have none."""
+"""The policy of a checkpoint, for programs without jax; those of older versions have none."""
 
 UNFINISHED, REMOVED = ".partial", ".removed"
 """Ends of the names of checkpoints that are written or removed, which begin with a dot."""
@@ -221,7 +221,7 @@ def given_run(run_dir: str | None, name: str | None) -> Path | None:
 
 
 def why_no_folder(path: str | os.PathLike[str]) -> str:
-    """What to say of a path that is no folder."""
+    """The message for a path that is no folder."""
     return "is not a folder" if os.path.exists(path) else "no such folder"
 
 
@@ -250,7 +250,7 @@ def make_folder(path: Path, shown: str, *, is_new: bool = False) -> None:
 def require_new_run(run_dir: str | None, name: str | None, hint: str = "") -> None:
     """Raises ConfigError if the run folder that the user names exists already.
 
-    `hint` is added where a run can go on or begin in it.
+    `hint` is added where a run can continue or begin in it.
     """
     root = given_run(run_dir, name)
     if root is None or not os.path.lexists(root):

@@ -20,7 +20,7 @@ def record_git(run: RunPaths, folder: Path) -> None:
 
     `git.json` has the commit, the branch, the lines of `git status` and whether they or the diff
     were cut off; `git.diff` the changes of tracked files, at most MAX_DIFF_BYTES. A folder that
-    cannot be written to is left to those who must write into it.
+    cannot be written to raises no error here: others that must write into it do.
     """
     commit = _git(folder, "rev-parse", "HEAD", limit=100)
     if not commit:
@@ -43,7 +43,7 @@ def record_git(run: RunPaths, folder: Path) -> None:
 
 
 def _git(folder: Path, *command: str, limit: int) -> bytes | None:
-    """What git says, at most `limit` bytes and one; None if it fails or takes too long."""
+    """The output of git, at most `limit` bytes and one; None if it fails or takes too long."""
     try:
         process = subprocess.Popen(
             ["git", "--no-optional-locks", *command],
@@ -59,14 +59,14 @@ def _git(folder: Path, *command: str, limit: int) -> bytes | None:
         timer = threading.Timer(_TIMEOUT_S, process.kill)
         timer.start()
         try:
-            said = process.stdout.read(limit + 1)
-            if len(said) > limit:
+            output = process.stdout.read(limit + 1)
+            if len(output) > limit:
                 process.kill()
-                return said
-            return said if process.wait() == 0 else None
+                return output
+            return output if process.wait() == 0 else None
         finally:
             timer.cancel()
 
 
-def _text(said: bytes | None) -> str:
-    return (said or b"").decode(errors="replace")
+def _text(output: bytes | None) -> str:
+    return (output or b"").decode(errors="replace")

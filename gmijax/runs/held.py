@@ -15,7 +15,7 @@ from gmijax.errors import BackendUnavailable, ConfigError, FolderLost, JobInterr
 from gmijax.runs.names import nearby
 
 _GONE: Final = (errno.ENOENT, errno.ENOTDIR, errno.ESTALE)
-"""Errors of a path that leads nowhere; others, of a network for one, say nothing."""
+"""Errors of a path that leads nowhere; others, of a network for one, do not show that."""
 
 
 class OpenFolder:
@@ -48,7 +48,7 @@ class OpenFolder:
             return error.errno not in _GONE
 
     def require(self) -> None:
-        """Raises FolderLost, which says where it is now, if its path does not lead to it."""
+        """Raises FolderLost, with its present path, if its path does not lead to it."""
         if self.is_there():
             return
         now = self._now()
@@ -134,7 +134,7 @@ def is_locked(lock: Path) -> bool:
     try:
         fd = try_lock(lock)
     except OSError:
-        return False  # Whoever wants it gets the reason later.
+        return False  # A command that needs the folder gets the reason later.
     if fd is not None:
         os.close(fd)
     return fd is None

@@ -1,6 +1,6 @@
 """Names that gmijax gives to what it numbers, so that it knows its own again.
 
-Whoever has a run may put copies, notes and other things beside what gmijax writes. Only a name of
+Users may put copies, notes and other things beside what gmijax writes. Only a name of
 exactly the right form is counted, read, moved or deleted.
 """
 
@@ -40,7 +40,7 @@ def by_steps(folder: Path, *, prefix: str = "", suffix: str = "") -> list[Path]:
       suffix: what stands behind them.
 
     Raises:
-      ConfigError: the folder cannot be read: nobody may take that for a folder without anything.
+      ConfigError: the folder cannot be read, which must not be taken for an empty folder.
     """
     return sorted(_named(folder, re.escape(prefix) + _STEPS + re.escape(suffix)))
 

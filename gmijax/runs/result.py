@@ -15,7 +15,7 @@ from gmijax.runs.folder import RunPaths, read_json
 def summary_of(run: RunPaths) -> dict[str, Any]:
     """The summary of a job; empty where there is none, or a damaged one.
 
-    No job goes on from it, and each writes its own, so a damaged one stands in nobody's way.
+    No job continues from it, and each writes its own, so a damaged one does no harm.
     """
     with suppress(ConfigError):
         return read_json(run.summary)

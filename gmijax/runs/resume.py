@@ -27,7 +27,7 @@ _MOST_NAMED: Final = 5
 def find_checkpoint(wanted: str, key: str) -> Path:
     """The checkpoint that `wanted` names, see `choose_checkpoint`.
 
-    Where nobody reads what was passed over, or has read it before.
+    For callers that do not report what was skipped, or have done so before.
     """
     return choose_checkpoint(wanted, key)[0]
 
@@ -73,7 +73,7 @@ def any_checkpoint(wanted: str, key: str) -> Path:
 
 
 def _no_checkpoint(folder: Path) -> str:
-    """Says that a folder has none, and where there are some: in the run, in those of a sweep."""
+    """The message that a folder has none, and where some are: in the run, in those of a sweep."""
     if folder == RunPaths(folder.parent).checkpoints and checkpoints_of(folder.parent):
         return f"no checkpoint in this folder; did you mean {folder.parent}?"
     jobs = sorted(path.name for path in _folders_in(folder) if checkpoints_of(path))

@@ -17,7 +17,7 @@ from gmijax.runs.names import nearby
 from gmijax.runs.resume import any_checkpoint
 
 _OWN_KEYS: Final = ("run.dir", "run.name", "run.resume", "run.profile", "env.source_sha256")
-"""Keys that every job has for itself, or of which something else is said."""
+"""Keys that every job has for itself, or for which another message exists."""
 
 
 def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
@@ -65,16 +65,16 @@ def config_of_run(run: RunPaths) -> dict[str, Any]:
 def require_own_values(
     config: Mapping[str, Any], run: RunPaths, command: Mapping[str, Any], saved: Mapping[str, Any]
 ) -> None:
-    """Blames the file of a run for a wrong value that a training which goes on takes from it.
+    """Names a run's file as the source of a wrong value that a resumed training takes from it.
 
     Args:
       config: of the training, as plain data.
       run: whose file it is.
       command: the same without what the run has saved.
-      saved: the same without what the command line says otherwise.
+      saved: the same without what the command line changes.
 
     Raises:
-      ConfigError: names the file; what the command line says wrongly is found later.
+      ConfigError: names the file; wrong values of the command line are found later.
     """
     wrong = _why_wrong(config)
     if wrong is not None and wrong == _why_wrong(saved) and wrong != _why_wrong(command):
@@ -103,7 +103,7 @@ def task_and_algorithm(saved: Mapping[str, Any], run: RunPaths) -> tuple[EnvConf
     """Task and algorithm of the saved configuration of a run.
 
     Keys that this version of gmijax does not know any more are left out. A key with a default in
-    its class is as it was before there was such a key; of any other nobody knows what a run
+    its class is as it was before there was such a key; of any other it is unknown what a run
     without it did.
 
     Raises:
@@ -161,14 +161,14 @@ def differences(saved: Mapping[str, Any], config: TrainConfig, run: RunPaths) ->
         key: f"{key} is {now.get(key)!r}, was {before.get(key)!r}"
         for key in dict.fromkeys((*now, *before))
         if now.get(key) != before.get(key)
-        # What was decided in its place is no other wish.
+        # The value that was decided for `auto` is no different setting.
         and key not in _OWN_KEYS
         and now.get(key) != "auto"
     }
 
 
 def left_out(checkpoint: Path) -> str | None:
-    """Says which keys `trained_config` leaves out of a run's configuration; None: none."""
+    """The message with the keys that `trained_config` leaves out of a configuration, if any."""
     unknown = _unknown_keys(saved_config(checkpoint))
     return f"left out, because this version does not know them: {unknown}" if unknown else None
 

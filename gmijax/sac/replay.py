@@ -1,7 +1,7 @@
 """The latest transitions of a GMI's environments, in the memory of its device.
 
 A ring of S steps of N environments. Every observation is there once: that behind a step is the one
-of the next row, where an episode goes on. Where it ended, the next row is the start of another
+of the next row, where an episode continues. Where it ended, the next row is the start of another
 one: nothing is needed of it after a termination, and where time ran out, or a simulation diverged,
 what follows is not known. A return of several steps ends before such a step, and a transition
 that begins with it is not learnt from. That leaves out one step of an episode.
@@ -151,7 +151,7 @@ def sample(
     kind = replay.kind[rows]
     kind = jnp.where(is_newest & (kind == GOES_ON), CUT, kind)
     goes_on = kind == GOES_ON
-    # All steps before it go on.
+    # All steps before it continue.
     is_reached = jnp.cumprod(jnp.roll(goes_on, 1, axis=1).at[:, 0].set(True), axis=1) > 0
     counts = is_reached & (kind != CUT)
     factors = discounting ** jnp.arange(n_step + 1, dtype=jnp.float32)

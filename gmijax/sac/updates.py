@@ -1,6 +1,6 @@
 """Updates of SAC: a batch of the replay, gradients, their mean over all GMIs, a step.
 
-Those of the critics and of the policy are apart; `gmijax.sac.sac` says when each is made.
+Those of the critics and of the policy are apart; `gmijax.sac.sac` decides when each is made.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class SacLosses(NamedTuple):
       critic_loss: cross-entropy, summed over both critics.
       policy_loss: of its own updates.
       entropy: of the policy in next states, in nats.
-      end_atoms: share of the targets at the ends of `value_range`; more than 0.01 says that the
+      end_atoms: share of the targets at the ends of `value_range`; more than 0.01 shows that the
         range is too small for the rewards.
     """
 

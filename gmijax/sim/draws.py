@@ -1,4 +1,4 @@
-"""Random numbers for tasks: by a JAX key, or by a `numpy.random.Generator` in its place.
+"""Random numbers for tasks: by a JAX key or by a `numpy.random.Generator`.
 
 A generator has a state, so what is split from it is itself. Imports jax for keys only.
 """

@@ -1,4 +1,4 @@
-"""Which MJX implementation runs. No jax here: the controller decides and says why."""
+"""Which MJX implementation runs. No jax here: the controller decides and prints why."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ def choose_impl(
     *,
     warp_installed: bool | None = None,
 ) -> tuple[Impl, str]:
-    """Decides which MJX implementation runs, and says why in a sentence.
+    """Decides which MJX implementation runs, and why, in a sentence.
 
     Args:
       impl: `auto`, `jax` or `warp`.
       device_platform: JAX's name of the device: `cpu`, `gpu` or `cuda`.
-      task: its name; None, or one that `ON_GPU` does not have, for a task of somebody else.
+      task: its name; None, or one that `ON_GPU` does not have, for a task of the user's.
       warp_installed: whether warp-lang can be imported; None to find out.
 
     Raises:

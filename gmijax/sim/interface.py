@@ -30,7 +30,7 @@ class EnvSpec(NamedTuple):
         is ended (see `gmijax.sim.divergence`).
       metrics: names of the numbers that judge an episode beside its return, such as successes.
       obs_terms: parts of an observation in order, name and length each; they go into exported
-        policies. Empty where nobody says.
+        policies. Empty where it is unknown.
       actor_obs_size: the policy sees the first so many numbers of an observation, the value
         function all of them (an asymmetric actor-critic); None: both see all.
     """
@@ -56,7 +56,7 @@ class EnvState(NamedTuple):
       obs: [O] float32.
       reward: [] float32, the sum of `reward_terms`.
       reward_terms: every addend of the reward by name, weight included, [] float32 each.
-      metrics: what the episode has come to by now, [] float32 each; the values of its last step
+      metrics: what the episode has reached by now, [] float32 each; the values of its last step
         are logged. Sums and means over an episode are kept in `task`.
       terminated: [] bool, the task has ended: the value of what follows is zero.
       truncated: [] bool, time ran out: bootstrap from the value of this observation.

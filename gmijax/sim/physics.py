@@ -94,7 +94,7 @@ class Physics:
     def poses(self, qpos: Array) -> tuple[Array, Array]:
         """Where all bodies are at `qpos` [nq]: for resets, which run no physics.
 
-        Always in MJX-JAX and with the model as it was loaded: what nobody reads of it is never
+        Always in MJX-JAX and with the model as it was loaded: what is not read of it is never
         computed.
 
         Returns:

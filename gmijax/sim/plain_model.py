@@ -25,7 +25,7 @@ WITHOUT_EFFECT = (
 
 
 def plain(mj_model: Model) -> Model:
-    """An equal model in words that MJX understands; itself where there is nothing to say anew.
+    """An equal model in words that MJX understands; itself where nothing has to be rewritten.
 
     Flags of `WITHOUT_EFFECT` are cleared. Damping and armature of actuators become those of the
     joints and tendons that they move, times their gears squared.

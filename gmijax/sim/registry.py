@@ -211,7 +211,7 @@ def make_env(
       max_envs: upper bound of environments stepped at once, for tasks of users that need one;
         None for no limit.
       source_sha256: digest of a custom task's file, which is not executed with another one.
-      rewards: weights of terms of the reward by name, in place of the task's own.
+      rewards: weights of terms of the reward by name, instead of the task's own.
       settings: numbers of the task by name (`gmijax.sim.tasks.settings`), as `rewards`.
       curriculum: whether an environment's episodes get harder as they succeed.
       api: `gmijax` for an `Env`, `brax` for a `brax.envs.Env` without a time limit, as Brax's

@@ -33,7 +33,7 @@ class RewardTerm(NamedTuple, Generic[View]):
 
 
 class Replacement(NamedTuple):
-    """A value that takes the place of the whole reward in some steps, such as a death penalty.
+    """A value that replaces the whole reward in some steps, such as a death penalty.
 
     Attributes:
       name: under which it is logged; it is a term like any other, zero while `when` is false.
@@ -72,7 +72,7 @@ def total_reward(
     Args:
       terms: the task's terms, in the order in which they are logged.
       view: what they read.
-      replacement: takes the place of all terms where it applies.
+      replacement: replaces all terms where it applies.
     """
     found = {
         name: 0.0 if term.weight == 0.0 else term.weight * term.fn(view)

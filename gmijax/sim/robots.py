@@ -204,7 +204,7 @@ BUFFERS: Mapping[str, WarpSizes] = MappingProxyType(
 """MJX-Warp's buffers for Playground's tasks on rough ground. Its own are too small, or written by
 the constructor over what was configured (Go1). In MuJoCo in C an environment, fallen robots too,
 had at most 21 contacts and 113 rows (G1), 16 and 88 (T1), 9 and 48 (Go1). All environments share
-the buffer of contacts, so one that needs more than its part finds room."""
+the buffer of contacts, so one may need more than its part."""
 
 
 def playground_name(name: str) -> str:

@@ -80,7 +80,7 @@ def pinned(env: EnvConfig) -> EnvConfig:
     except OSError as error:
         raise ConfigError(f"env={nearby(path)}: cannot be read ({error.strerror})") from None
     if env.source_sha256 not in (None, digest):
-        # To open a run is not to say that whatever its file holds by now may be executed.
+        # Opening a run is no consent to execute whatever its file holds by now.
         how = "has changed" if env.source_sha256 else "may have changed"
         key = shlex.quote(f"env={nearby(path)}:{function}")
         raise ConfigError(
@@ -116,7 +116,7 @@ def executed(env: EnvConfig) -> str | None:
 
 
 def changes(env: EnvConfig, saved: Mapping[str, Any]) -> str | None:
-    """Says that the file of a pinned custom task is another one than that of a saved run.
+    """The message that the file of a pinned custom task is not that of a saved run.
 
     Args:
       env: the task, `pinned`.

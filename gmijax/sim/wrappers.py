@@ -165,7 +165,7 @@ def episode_statistics(
     """Adds the step that led to `state` [N] to the sums of `before`.
 
     Returns:
-      Returns [N] and term sums [N] of the episodes that go on (zero where one ended), and the
+      Returns [N] and term sums [N] of the episodes that continue (zero where one ended), and the
       sums over the whole ones that ended.
     """
     over = state.terminated | state.truncated

@@ -59,7 +59,7 @@ class ChildLink:
         which other processes compiled are `waiting` alone.
 
     Args:
-      heartbeat_fd: inherited memory for beats and errors, None where nobody reads them.
+      heartbeat_fd: inherited memory for beats and errors, None where no process reads them.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class ChildLink:
         self._part_began_s = now_s
 
     def begin_compiling(self) -> None:
-        """Says that this GMI compiles from now on."""
+        """Reports that this GMI compiles from now on."""
         self.end_part("tracing")
         self.beat("compiling", 0)
 
@@ -164,16 +164,16 @@ class ChildLink:
         self._block.write(Heartbeat(state, iteration, os.getpid()))
 
     def report_error(self, error: BaseException) -> None:
-        """Says why this GMI fails, also in `error.json`; end with a non-zero code after it."""
-        said = ReportedError(
+        """Reports why this GMI fails, also in `error.json`; end with a non-zero code after it."""
+        report = ReportedError(
             type(error).__name__,
             str(error),
             "".join(traceback.format_exception(error)),
             error.missing if isinstance(error, CollectiveTimeout) else (),
         )
-        self._block.write_error(said)
+        self._block.write_error(report)
         with suppress(OSError):  # The disk may be what is wrong.
-            write_json(self.paths.error, said._asdict())
+            write_json(self.paths.error, report._asdict())
 
     def _hold_lifeline(self, lifeline_fd: int) -> None:
         while True:
@@ -239,7 +239,7 @@ def _leave_signals_to_controller() -> None:
 
 
 def _end_now() -> None:
-    # No clean-up: it could wait for a peer or a GPU forever, and nobody is left who would
+    # No clean-up: it could wait for a peer or a GPU forever, and no process is left that would
     # read the outcome. Helper processes must not stay behind either.
     if os.getpgrp() == os.getpid():
         os.killpg(0, signal.SIGKILL)

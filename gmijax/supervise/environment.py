@@ -61,7 +61,7 @@ def gmi_environment(
     else:
         own = _gpu(allocation)
         if plan.inter != "nccl":
-            # All of a ring are on this host, and NCCL's sockets are open to whoever reaches them.
+            # All of a ring are on this host, and NCCL's sockets are open to any client.
             defaults[NCCL_INTERFACE] = "lo"
     return {**defaults, **kept, **own, **_common(allocation), **backend_environment}
 

@@ -26,7 +26,7 @@ _GPU_FAULT = re.compile(r"CUDA_ERROR_(?!OUT_OF_MEMORY)|ended by SIGABRT|MPS daem
 """Matches messages of jobs whose GPU faulted. XLA aborts where it cannot raise."""
 
 _NOTHING_FITS = "All configs failed during profiling"
-"""What XLA says where it has no memory to try kernels."""
+"""XLA's message where it has no memory to try kernels."""
 
 _FATAL = "Fatal Python error: "
 _STACKS = re.compile(
@@ -50,7 +50,7 @@ def describe_exit(
         own = "not killed by gmijax; perhaps the machine ran out of memory"
     reason = f"{how}: {own}" if own else how
     if error and error.type == NodeLost.__name__:
-        reason = own  # Nobody saw how it ended.
+        reason = own  # How it ended is unknown.
     return GmiFailed(gmi, reason, iteration=iteration, error=error, exit_code=exit_code)
 
 
@@ -92,7 +92,7 @@ def first_cause(failures: Sequence[GmiFailed]) -> GmiFailed:
 def may_be_neighbours(reason: str) -> bool:
     """Whether the fault can be that of another client of the same MPS daemon.
 
-    A fatal fault of one client ends all clients on its GPU, and CUDA does not say whose it was
+    A fatal fault of one client ends all clients on its GPU, and CUDA does not report whose it was
     (https://docs.nvidia.com/deploy/mps/, "Memory protection and error containment").
     """
     return _GPU_FAULT.search(reason) is not None

@@ -76,7 +76,7 @@ class GmiProcess(WatchedGmi):
         """See `WatchedGmi`."""
         self._refresh()
         if self.exit_code is None and self._has_ended():
-            # Before the zombie is reaped its group's number cannot go to somebody else.
+            # Before the zombie is reaped its group's number cannot be reused.
             others = members_of(self.pid)
             self.kill()
             wait_until_gone(others, _GROUP_ENDS_S)
@@ -133,7 +133,7 @@ class GmiProcess(WatchedGmi):
             return True
 
     def _refresh(self) -> None:
-        self._heard(self._block.beats, self._block.read())
+        self._record_heartbeat(self._block.beats, self._block.read())
 
 
 def _spawn(
@@ -142,7 +142,7 @@ def _spawn(
     # The child inherits that they are blocked, until it can leave them to this process.
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
-        # Files, not pipes: a child that floods a pipe which nobody reads would block.
+        # Files, not pipes: a child that floods a pipe without a reader would block.
         with paths.stdout.open("wb") as stdout, paths.stderr.open("wb") as stderr:
             return subprocess.Popen(
                 command,

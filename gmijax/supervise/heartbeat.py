@@ -1,4 +1,4 @@
-"""The heartbeat: how a GMI says how far it is and why it fails, in memory of both processes.
+"""The heartbeat: how a GMI reports its progress and why it fails, in memory of both processes.
 
 Not a file: it is written within training, where a full or a slow disk must not end or delay it.
 A block of eight 64-bit numbers (beats, state, iteration, process, bytes of the error), then the
@@ -49,7 +49,7 @@ class HeartbeatBlock:
     """Memory for the beats and the error of one GMI.
 
     Args:
-      fd: of `create`, or inherited; None for memory that nobody else reads.
+      fd: of `create`, or inherited; None for memory that no other process reads.
     """
 
     def __init__(self, fd: int | None = None) -> None:
@@ -69,7 +69,7 @@ class HeartbeatBlock:
         return self._numbers[_BEATS]
 
     def write(self, beat: Heartbeat) -> None:
-        """Takes the place of the beat before."""
+        """Replaces the beat before."""
         self._numbers[_STATE] = STATES.index(beat.state)
         self._numbers[_ITERATION] = beat.iteration
         self._numbers[_PID] = beat.pid
@@ -83,7 +83,7 @@ class HeartbeatBlock:
         return Heartbeat(state, self._numbers[_ITERATION], self._numbers[_PID])
 
     def write_error(self, error: ReportedError) -> None:
-        """Says why the GMI fails; of a long message the gist, of a long traceback the end."""
+        """Reports why the GMI fails; of a long message the gist, of a long traceback the end."""
         is_long = len(error.message) > _MAX_MESSAGE
         message = gist_of(error.message) if is_long else error.message
         cut = error._replace(
@@ -96,7 +96,7 @@ class HeartbeatBlock:
         self._numbers[_ERROR_BYTES] = len(text)
 
     def read_error(self) -> ReportedError | None:
-        """Why the GMI failed, None if it has not said so."""
+        """Why the GMI failed, None if it has reported no error."""
         size = self._numbers[_ERROR_BYTES]
         if not size:
             return None

@@ -1,7 +1,7 @@
 """Cleans up after a controller that was killed: `python -m gmijax.supervise.janitor`.
 
 A killed controller runs no clean-up. GMIs end by themselves then, but one that hangs in a driver
-cannot, and an MPS daemon outlives whoever started it. So a janitor is started before
+cannot, and an MPS daemon outlives the process that started it. So a janitor is started before
 them, in a session of its own, and reads from a pipe what there is to clean, one JSON object a line
 (see `JanitorLink`). The pipe's end without the word `clean` means that the controller is gone.
 """
@@ -85,7 +85,7 @@ class JanitorLink:
             self._send({"gmi": list(process), "group": group or pid})
 
     def dismiss(self) -> None:
-        """Says that everything is clean and waits for the janitor to end."""
+        """Reports that everything is clean and waits for the janitor to end."""
         self._send({"clean": True})
         self._pipe.close()
         if not has_ended(self._process, _DAEMON_ENDS_S):
@@ -101,14 +101,14 @@ class JanitorLink:
         self._process.wait()
 
     def _send(self, message: dict[str, Any]) -> None:
-        # A janitor that somebody killed must not end the job that it only guards.
+        # A janitor that was killed must not end the job that it only guards.
         self._pipe.write(json.dumps(message).encode() + b"\n")
 
 
 def quit_daemon(control: MpsControl) -> None:
     """Ends a daemon that gmijax has started, and removes its pipe directory.
 
-    A daemon or server that does not end when asked is killed: nobody else knows of it.
+    A daemon or server that does not end when asked is killed: no other process knows of it.
     """
     daemon = control.daemon_pid()
     pids = {daemon} if daemon is not None else set()
@@ -125,7 +125,7 @@ def quit_daemon(control: MpsControl) -> None:
 
 def main() -> int:
     """Reads messages until the pipe ends, then cleans up unless the controller has."""
-    for number in STOP_SIGNALS:  # They may come to all processes of a job.
+    for number in STOP_SIGNALS:  # All processes of a job may get them.
         signal.signal(number, signal.SIG_IGN)
     groups: defaultdict[int, set[ProcessId]] = defaultdict(set)
     daemons: list[MpsControl] = []
@@ -177,7 +177,7 @@ def _with_members(groups: _Groups) -> _Groups:
     """The groups in which a known member runs, with all that run in them now.
 
     A group keeps its number while it has a member, also without its leader; an empty one may lose
-    it to somebody else's.
+    it to another one.
     """
     left: dict[int, set[ProcessId]] = {}
     for group, known in groups.items():

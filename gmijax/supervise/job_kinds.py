@@ -1,7 +1,7 @@
 """Kinds of jobs: their plans, the main that their GMIs run, the memory that these share.
 
 Real jobs, their restarts and the profiles of a search all start GMIs by these; GMIs of
-asynchronous jobs ask here who the others are.
+asynchronous jobs ask here which GMIs the others are.
 """
 
 from __future__ import annotations
@@ -114,12 +114,12 @@ def training_plan(
         return make_plan(config.plan, config.reduce, num_envs, machine, nodes=nodes)
     if config.plan.layout is None and nodes is None:
         require_host(*num_gmis_of(config.plan), config.plan, machine)
-    wishes, num_nodes = config.plan, 1
+    requested, num_nodes = config.plan, 1
     if nodes is not None:
         assert config.cluster.nodes != "auto"
         num_nodes = len(nodes)
-        wishes = on_fewer_nodes(wishes, config.cluster.nodes, num_nodes)
-    placed = place(wishes, num_nodes)
+        requested = on_fewer_nodes(requested, config.cluster.nodes, num_nodes)
+    placed = place(requested, num_nodes)
     plan = make_plan(
         placed.plan,
         config.reduce,
@@ -167,7 +167,7 @@ def why_not_device(plan: Plan) -> str | None:
     far = [gmi for gmi in topology.agents if topology.gpu_of[gmi] not in training]
     if not far:
         return None
-    return f"agent {far[0]} is on GPU {topology.gpu_of[far[0]]} of the job, where nobody trains"
+    return f"agent {far[0]} is on GPU {topology.gpu_of[far[0]]} of the job, where no GMI trains"
 
 
 def groups_of(plan: Plan) -> tuple[Group, Group]:

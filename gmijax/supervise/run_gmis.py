@@ -37,7 +37,7 @@ def run_gmis(
     Args:
       launch: what to run.
       on_tick: see above.
-      signals: those that the caller hears already; None: heard while this runs.
+      signals: those that the caller handles already; None: this handles them while it runs.
 
     Raises:
       GmiFailed: a GMI failed; names the first one.
@@ -114,9 +114,9 @@ def recorded(
 
 
 def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:
-    """Enters the plan's backend, or `share` where the plan allows it and says so afterwards.
+    """Enters the plan's backend, or `share`, with a note in the plan, where the plan allows it.
 
-    Whether daemons may be started here (rights, somebody else's daemon) shows only when it is
+    Whether daemons may be started here (rights, another user's daemon) shows only when it is
     tried.
     """
     plan, machine, run = launch.plan, launch.machine, launch.run

@@ -105,7 +105,7 @@ def exit_code_beside(work: Callable[[], None]) -> int:
     """Does the work of such a process; returns its exit code: 0, or 1 with a line on stderr."""
     try:
         work()
-    # Whatever it is, training goes on without it.
+    # Whatever it is, training continues without it.
     except Exception as error:
         sys.stderr.write(with_type(type(error).__name__, " ".join(str(error).split())) + "\n")
         return 1
@@ -113,4 +113,4 @@ def exit_code_beside(work: Callable[[], None]) -> int:
 
 
 def _nothing(_: str) -> None:
-    """Says nothing."""
+    """Prints nothing."""

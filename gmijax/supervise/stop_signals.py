@@ -1,4 +1,4 @@
-"""Signals that ask a job to save and end, and how much of a hurry they are in."""
+"""Signals that ask a job to save and end, and how urgent they are."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Final
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 """What asks a job to save and end: Ctrl-C, batch systems, a terminal that is closed.
 
-The controller hears them; a GMI with a lifeline ignores them."""
+The controller handles them; a GMI with a lifeline ignores them."""
 
 _AGAIN_S: Final = 1.0
 
@@ -22,12 +22,12 @@ class StopSignals:
     """Signals that ask for an end: the first one, and the same one again a second later or more.
 
     A program such as `timeout` sends its signal twice at once, and a batch system sends others
-    before the last: that is no impatience.
+    before the last: these do not count as a second request.
 
     Attributes:
       requests: how many have come that count: the first asks to save and end, the second to end.
-      name: what the last request that counted is called: `Ctrl-C`, or a signal's name.
-      are_urgent: whether one of them was not Ctrl-C: whoever has sent it may soon kill the job.
+      name: of the last request that counted: `Ctrl-C`, or a signal's name.
+      are_urgent: whether one of them was not Ctrl-C: its sender may soon kill the job.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class StopSignals:
 
 @contextmanager
 def stop_signals() -> Iterator[StopSignals]:
-    """Hears `STOP_SIGNALS` in place of whatever they did."""
+    """Handles `STOP_SIGNALS` while it is entered; restores the handlers before them."""
     signals = StopSignals()
     # Python delivers signals to the main thread only; elsewhere they are the caller's business.
     is_main = threading.current_thread() is threading.main_thread()

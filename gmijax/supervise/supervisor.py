@@ -42,7 +42,7 @@ class Supervisor:
         hold the number of the descriptor.
       start: starts a GMI; None: on this machine.
       signals: looked at for a request to end: the first lets the GMIs finish their iteration and
-        save; the second ends them. None: nobody asks.
+        save; the second ends them. None: there are no such requests.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class Supervisor:
             what = f"made no progress after iteration {iteration}; GMI {cause.gmi} {cause.reason}"
             raise GmiFailed(stuck.gmi, what, iteration=iteration)
         if cause.error is not None and ended_with(cause, ConfigError):
-            # Bad input stays bad input; the end of its line has the place.
+            # Bad input stays bad input; its line ends with the location.
             raise ConfigError(first_line(cause.error.message, None))
         raise cause
 
@@ -180,7 +180,7 @@ class Supervisor:
         self._require_in_time()
 
     def _require_in_time(self) -> None:
-        """After Ctrl-C a person waits, and can end it: until then GMIs may go on if they do."""
+        """After Ctrl-C a user waits, and can end it: until then GMIs that work may continue."""
         if self._launch.waits_after_ctrl_c and not self._signals.are_urgent:
             return  # `_check_progress` ends those that hang.
         now_s = running_s()

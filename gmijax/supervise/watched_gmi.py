@@ -65,7 +65,7 @@ class WatchedGmi(ABC):
 
     @property
     def is_ready(self) -> bool:
-        """Whether the GMI has once been ready, or has ended well without saying so."""
+        """Whether the GMI has once been ready, or has ended well without reporting it."""
         return self._was_ready or self.exit_code == 0
 
     def status(self) -> GmiStatus:
@@ -104,7 +104,7 @@ class WatchedGmi(ABC):
 
     @abstractmethod
     def end_as_done(self) -> None:
-        """Ends a GMI that has said that it is done, but whose process stays."""
+        """Ends a GMI that has reported that it is done, but whose process stays."""
 
     @abstractmethod
     def kill(self) -> None:
@@ -114,8 +114,8 @@ class WatchedGmi(ABC):
     def close(self) -> None:
         """Drops the lifeline: a process that is still there ends itself."""
 
-    def _heard(self, beats: int, beat: Heartbeat | None) -> None:
-        """Takes note of the newest heartbeat; one with equal content counts as progress too."""
+    def _record_heartbeat(self, beats: int, beat: Heartbeat | None) -> None:
+        """Records the newest heartbeat; one with equal content counts as progress too."""
         if beats != self.beats and beat is not None:
             self.beat, self.beats = beat, beats
             self._was_ready |= beat.is_ready

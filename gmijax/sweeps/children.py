@@ -20,14 +20,14 @@ from gmijax.runs.held import try_lock
 from gmijax.supervise.failures import last_line
 
 INTERRUPT_BYTE: Final = b"i"
-"""Comes by the lifeline of a controller in place of Ctrl-C."""
+"""Sent through the lifeline of a controller instead of Ctrl-C."""
 
 _OF_ALL_JOBS: Final = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EROFS),
     *(errno.EIO, errno.ESTALE, errno.ENOTCONN, errno.ETIMEDOUT),
     *(errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM),
 )
-"""Errors of a start that the next job would meet too: no disk or one that is gone, no descriptors,
+"""Errors of a start that the next job would have too: no disk or one that is gone, no descriptors,
 processes or memory."""
 
 _STAY_S = 15.0
@@ -141,7 +141,7 @@ class Child:
         """Asks it to save and end.
 
         A controller asks its GMIs. A command may be a shell, which does not pass a signal on: it
-        comes to all of its process group, as Ctrl-C does.
+        reaches all of its process group, as Ctrl-C does.
         """
         with suppress(ProcessLookupError, PermissionError):
             if not self._is_client:
@@ -164,7 +164,7 @@ class Child:
             os.killpg(self.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """After its end, or in place of it; what is left of its process group ends too."""
+        """Call it after its end, or to end it; what is left of its process group ends too."""
         self.kill()
         self._pipe.close()
         has_ended(self._process, self._killed_s + _KILLED_S - running_s())
@@ -180,7 +180,7 @@ def errors_of_one_job(cwd: str | None = None) -> Iterator[None]:
 
     Raises:
       JobNotStarted: with the reason; the next job may start.
-      OSError: the next job would meet the same.
+      OSError: the next job would fail in the same way.
     """
     try:
         yield

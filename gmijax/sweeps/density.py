@@ -29,7 +29,7 @@ class JobProgress(NamedTuple):
 
     Attributes:
       done: steps, or the part of the whole that is done: what is summed over jobs.
-      reports: how often it has said so since it was started.
+      reports: how often it has reported so since it was started.
     """
 
     done: float
@@ -81,10 +81,10 @@ class ConcurrencySearch:
         self._window: _RateWindow | None = None
 
     def look(self, now_s: float, jobs: Mapping[int, JobProgress]) -> Decision | None:
-        """Takes in how far all jobs of the GPU are; returns what to change, if anything.
+        """Updates the progress of all jobs of the GPU; returns what to change, if anything.
 
         Args:
-          now_s: by a clock that only goes on.
+          now_s: by a clock that never goes back.
           jobs: those that run, by number.
         """
         if self.is_settled or len(jobs) != self.target:

@@ -22,7 +22,7 @@ class JobEvents:
     Keys are only ever added. A number that is not known is null.
 
     Args:
-      stream: a line is written for each event, until nobody reads it any more; None: nobody does.
+      stream: gets a line for each event, as long as it is read; None: there is no reader.
       name: of the command, e.g. `pack`.
       jobs: those that are known; more may be added to the list.
       paths: their files.
@@ -66,7 +66,7 @@ class JobEvents:
         found = {key: report.get(key) for key in ("status", "ranking", "settings", "wall_s")}
         states = [job.progress.state for job in self._jobs]
         failed = [job.number for job in self._jobs if job.progress.state == "failed"]
-        # By state, and by number those that somebody may have to mend.
+        # By state, and by number those that the user may have to fix.
         found |= {"jobs": dict(Counter(states)), "failed": failed}
         self._write(f"{self._name}_ended", **found)
 
@@ -98,7 +98,7 @@ class JobEvents:
         try:
             self._stream.write(f"{line}\n")
             self._stream.flush()
-        except (OSError, ValueError):  # Nobody reads; the jobs go on.
+        except (OSError, ValueError):  # The reader is gone; the jobs continue.
             self._stream = None
 
 

@@ -52,7 +52,7 @@ def _found(folder: Path, work: Work[J]) -> Path:
 
 
 def require_folders(paths: SweepPaths, numbers: Iterable[int]) -> None:
-    """Raises ConfigError where something else stands in place of the folder of a job."""
+    """Raises ConfigError where the path of a job's folder is something else."""
     for number in numbers:
         for folder in (paths.run_dir(number), paths.job(number).root, paths.log(number).parent):
             if os.path.lexists(folder) and not folder.is_dir():
@@ -64,7 +64,7 @@ def errors_of_files(paths: SweepPaths) -> Iterator[None]:
     """Turns an error of a file into one line.
 
     Raises:
-      ConfigError: a folder stands in place of a file, or a file in place of a folder.
+      ConfigError: a path is a folder instead of a file, or a file instead of a folder.
       SweepFailed: anything else, such as a full disk.
     """
     try:

@@ -40,7 +40,7 @@ class HeldJobs:
         self._since_s: dict[int, float] = {}
 
     def has(self, job: AnyJob) -> bool:
-        """Whether a process holds the folder of a job that waits; its note soon says which."""
+        """Whether a process holds the folder of a waiting job; its note soon names the process."""
         lock, progress = self._paths.job(job.number).lock, job.progress
         if not is_locked(lock):
             if self._since_s.pop(job.number, None) is not None:

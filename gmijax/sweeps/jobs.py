@@ -82,7 +82,7 @@ def jobs_of(configs: Sequence[TrainConfig]) -> tuple[Job, ...]:
 
 
 def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
-    """Refuses jobs that say themselves where they run, or that no slot is large enough for.
+    """Refuses jobs that set themselves where they run, or that no slot is large enough for.
 
     Raises:
       ConfigError: names the key.
@@ -117,7 +117,7 @@ def placed(
         wanted,
         backend=backend if wanted.backend == "auto" else wanted.backend,
         memory_fraction=slot.memory_fraction(job.config),
-        # The daemon is the sweep's, and caps nobody.
+        # The daemon is the sweep's, and caps no client.
         self_check="off" if wanted.self_check == "auto" else wanted.self_check,
     )
     wandb = job.config.wandb
@@ -126,7 +126,7 @@ def placed(
 
 
 def started_in(config: TrainConfig, run: RunPaths) -> TrainConfig:
-    """The configuration of a job in its run folder, where it goes on from what is there."""
+    """The configuration of a job in its run folder, where it continues from what is there."""
     own = dataclasses.replace(config.run, dir=str(run.root), name=None, resume="auto")
     return dataclasses.replace(config, run=own)
 

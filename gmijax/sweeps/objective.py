@@ -1,4 +1,4 @@
-"""What jobs of a sweep are ranked by, and how good each is: one definition for all who compare."""
+"""What jobs of a sweep are ranked by, and how good each is: one definition for all comparisons."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def find(line: Mapping[str, Any], objective: str) -> ObjectiveValue | None:
         return ObjectiveValue(long, bool(line.get("window/full")), count)
     if (number := number_in(line, objective)) is None:
         return None
-    # Of a run of an older version, whose lines do not say over what they are means.
+    # Of a run of an older version, whose lines do not state over what they are means.
     return ObjectiveValue(number, is_full=not objective.startswith(_OF_EPISODES))
 
 

@@ -54,7 +54,7 @@ class PackPlanner:
         self._begins.pop(job.number, None)
 
     def _begin(self, job: Job) -> int | None:
-        """The step that a job goes on from; None: it has to say itself why it cannot, or need not.
+        """The step that a job continues from; None: it need not, or reports itself why it cannot.
 
         Kept, because it takes reading whole checkpoints.
         """
@@ -139,6 +139,6 @@ def own_end(job: Job, run: RunPaths) -> OwnEnd | None:
     if state_of(run, job.config) == "completed":
         return OwnEnd(None)
     if run.gmi(0).error.exists():
-        said = read_json(run.gmi(0).error)
-        return OwnEnd(with_type(str(said.get("type")), str(said.get("message") or "")))
+        error = read_json(run.gmi(0).error)
+        return OwnEnd(with_type(str(error.get("type")), str(error.get("message") or "")))
     return None

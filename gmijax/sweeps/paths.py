@@ -10,7 +10,7 @@ DIGITS = 3
 """Of the number of a job in the names of its files; more jobs have more digits."""
 
 ENV_PACK_DIR = "GMIJAX_PACK_DIR"
-"""Tells a job of a pack the pack's folder."""
+"""The folder of a pack, for its jobs."""
 
 
 class SweepPaths(RunPaths):
@@ -23,12 +23,12 @@ class SweepPaths(RunPaths):
 
     def __init__(self, root: Path, name: str = "sweep") -> None:
         super().__init__(root)
-        self.request = root / "request.json"  # What was asked: a command that goes on asks it too.
+        self.request = root / "request.json"  # What a continued command must repeat.
         self.study = root / "study.log"  # Of Optuna.
         self.sweep = root / f"{name}.json"  # Jobs, their states and results.
         self.table = root / f"{name}.csv"  # One line a job.
         self.settings = root / "settings.csv"  # One line for all seeds of a setting.
-        self.room = root / ".room"  # Of no use but its size: room for how the sweep ends.
+        self.reserve = root / ".room"  # Only its size counts: disk space for the last report.
         self.curves = root / f"{name}.png"
 
     def job(self, number: int) -> RunPaths:

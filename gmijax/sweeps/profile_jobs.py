@@ -1,4 +1,4 @@
-"""Trains copies of a job at the same time for a few seconds, and says how fast each was."""
+"""Trains copies of a job at the same time for a few seconds, and measures how fast each was."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gmijax.sweeps.study import Study
 from gmijax.sweeps.training import TrainingKind
 
 UNKNOWN_MIB = 1.0
-"""Memory of jobs that did not say how much they took."""
+"""Memory of jobs that did not report how much they took."""
 
 _FOREVER = 10**12
 
@@ -59,7 +59,7 @@ def profile_jobs(
         window = CurveWindow(jobs, limit_s)
 
         def tick() -> None:
-            # Once: a second signal would end the jobs before they say how much memory they took.
+            # Once: a second signal would end the jobs before they report their memory.
             if not inner.have_come and (window.is_over() or signals.have_come):
                 inner.handle(signal.SIGTERM)
 
@@ -113,7 +113,7 @@ def profiled_job(job: Job, seed: int, num_timesteps: int) -> Job:
 
 
 def _memory_mib(paths: SweepPaths, jobs: Sequence[Job]) -> float:
-    """Peak memory of the largest job, MiB; `UNKNOWN_MIB` where none says it."""
+    """Peak memory of the largest job, MiB; `UNKNOWN_MIB` where none reports it."""
     results = [TrainResult.read(paths.job(job.number).gmi(0).result) for job in jobs]
     peaks = [one.peak_memory_mib or UNKNOWN_MIB for one in results if one is not None]
     return max(peaks, default=UNKNOWN_MIB)

@@ -27,7 +27,7 @@ class Progress:
       env_steps: environment steps so far.
       env_steps_per_s: of the last iteration; 0 while it does not run.
       reports: lines of metrics since it was started.
-      num_timesteps: steps at its end, where its lines say them.
+      num_timesteps: steps at its end, where its lines have them.
       value: what it is ranked by (`value_of`), None before there is one.
       is_full: whether the value can be compared, see `ObjectiveValue`.
       episodes: how many the value is a mean over, where that is known.
@@ -43,7 +43,7 @@ class Progress:
       node: address of the node where it runs or ran last; None: this machine.
       attempts: how often this command has started it.
       exit_code: of its process, once that has ended; negative for the signal that ended it.
-      note: what is to be known of it, in one line, although it goes on.
+      note: a remark in one line on a job that continues.
       error: why it failed, in one line.
       curve: environment steps and objective of the lines of metrics that can be compared, or,
         while there are none, of the others.
@@ -95,7 +95,7 @@ class Progress:
         return (self.env_steps - self._first_steps) / passed_s if passed_s >= _LEAST_S else None
 
     def report(self, line: Mapping[str, Any], ranking: Ranking) -> None:
-        """Takes in a line of metrics that has just come."""
+        """Adds a new line of metrics."""
         self.take(line, ranking)
         self.reports += 1
         self.reported_s = time.monotonic()
@@ -103,7 +103,7 @@ class Progress:
             self.updated_s, self._first_steps = self.reported_s, self.env_steps
 
     def take_summary(self, summary: Mapping[str, Any]) -> None:
-        """Takes in how an earlier command has completed it."""
+        """Adds the summary of an earlier command that has completed it."""
         wall_s, rate = summary.get("wall_s"), summary.get("env_steps_per_s")
         self.earlier_s = wall_s if isinstance(wall_s, float) else 0.0
         self.earlier_steps_per_s = rate if isinstance(rate, float) else None
@@ -120,7 +120,7 @@ class Progress:
         self.reports, self.reported_s, self.exit_code = 0, None, None
 
     def take(self, line: Mapping[str, Any], ranking: Ranking) -> None:
-        """Takes in a line of metrics."""
+        """Adds a line of metrics."""
         self.env_steps = line["env_steps"]
         self.env_steps_per_s = line.get("env_steps_per_s") or 0.0
         self.num_timesteps = line.get("num_timesteps") or self.num_timesteps
@@ -137,7 +137,7 @@ class Progress:
         self.value = value_of(self.curve, ranking)
 
     def read(self, run: RunPaths, ranking: Ranking) -> None:
-        """Takes in all metrics that a run folder has."""
+        """Reads all metrics that a run folder has."""
         self.value, self.latest, self.curve, self.env_steps = None, None, [], 0
         self.is_full, self.episodes = True, None
         for line in read_metrics(run.metrics):

@@ -42,10 +42,10 @@ _OF_JOB = (
 )
 _OF_SETTING = ("n", "interquartile_mean", "low", "high", "window_full")
 
-_ROOM_BYTES = 1 << 16
+_RESERVE_BYTES = 1 << 16
 
 _MOST_TYPED_DIGITS = 8
-"""A number with a point and more digits was drawn: nobody types that."""
+"""A number with a point and more digits was sampled, not typed."""
 
 
 class JobsReport:
@@ -78,20 +78,20 @@ class JobsReport:
         self.data: dict[str, Any] = {}
 
     def begin(self) -> None:
-        """Says that the sweep runs, and keeps room for how it ends.
+        """Writes that the sweep runs, and reserves disk space for the last report.
 
         Raises:
           OSError: there is none.
         """
         self._write("running")
         draw_curves(self._jobs, self._ranking, self._paths)
-        size = _ROOM_BYTES + 2 * self._paths.sweep.stat().st_size
-        with self._paths.room.open("wb") as file:
+        size = _RESERVE_BYTES + 2 * self._paths.sweep.stat().st_size
+        with self._paths.reserve.open("wb") as file:
             try:
                 os.posix_fallocate(file.fileno(), 0, size)
             except OSError as error:
                 if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                    raise  # Others: not every file system can keep room.
+                    raise  # Others: not every file system can reserve space.
 
     def update(self) -> None:
         """Writes the tables if the state of a job has changed.
@@ -110,7 +110,7 @@ class JobsReport:
             self._write("running")
 
     def end(self, status: str) -> str | None:
-        """Says how the sweep has ended; why that cannot be written, if it cannot.
+        """Writes how the sweep has ended; returns why that cannot be written, if it cannot.
 
         Raises:
           FolderLost: the sweep's folder is no longer there.
@@ -118,7 +118,7 @@ class JobsReport:
         self._folder.require()
         wrong = None
         with suppress(OSError):
-            self._paths.room.unlink(missing_ok=True)
+            self._paths.reserve.unlink(missing_ok=True)
         for write in (
             lambda: self._write(status),
             lambda: draw_curves(self._jobs, self._ranking, self._paths),
@@ -216,7 +216,7 @@ def _job_table(jobs: Sequence[Row], ranking: Ranking) -> Table:
 
 
 def _labels(rows: Sequence[Row]) -> list[str]:
-    """Overrides of every row, with drawn numbers short where that tells all rows apart."""
+    """Overrides of every row, with sampled numbers shortened if all rows still differ."""
     whole = [label_of(row["overrides"]) for row in rows]
     short = [
         label_of({key: _short(value) for key, value in row["overrides"].items()}) for row in rows
@@ -274,7 +274,7 @@ def draw_curves(jobs: Sequence[AnyJob], ranking: Ranking, paths: SweepPaths) -> 
             axes.fill_between(steps, middle.low, middle.high, alpha=0.2)
     axes.set(xlabel="environment steps", ylabel=ranking.objective)
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small").set_in_layout(False)  # However long it is, curves have room.
+    axes.legend(fontsize="small").set_in_layout(False)  # A long one must not shrink the curves.
     drawn_png = io.BytesIO()
     figure.savefig(drawn_png, dpi=120)
     write_bytes(paths.curves, drawn_png.getvalue())

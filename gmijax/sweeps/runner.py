@@ -50,7 +50,7 @@ class SweepResult(NamedTuple):
 
 
 def run_work(work: Work[J], *, show: Show = False, events: TextIO | None = None) -> SweepResult:
-    """Runs all jobs, as many at a time as the settings say, and compares them.
+    """Runs all jobs, as many at a time as the settings allow, and compares them.
 
     Called again with the same work and folder, it runs those that are not complete.
 
@@ -68,7 +68,7 @@ def run_work(work: Work[J], *, show: Show = False, events: TextIO | None = None)
     started_s = time.monotonic()
     console = open_console(show=show)
     with _hosts_of(work) as hosts:
-        # Before anything is started: whether there are such GPUs, and room for so many jobs.
+        # Before anything is started: whether there are such GPUs, and slots for so many jobs.
         work.require_runnable(work.sites(hosts))
         if work.settings.sampler != "grid":
             optuna_package()
@@ -267,7 +267,7 @@ def _beginning(work: Work[J], paths: SweepPaths, console: Console) -> tuple[list
 
 
 def _require_same(work: Work[J], wanted: Mapping[str, Any], paths: SweepPaths) -> None:
-    """Raises ConfigError if a folder holds other jobs, or does not say which it holds."""
+    """Raises ConfigError if a folder holds other jobs, or has no record of which it holds."""
     if not paths.request.exists():
         return
     elsewhere = "give another folder"

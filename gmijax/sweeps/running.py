@@ -29,7 +29,7 @@ class JobOutcome(NamedTuple):
       error: why it failed.
       is_fault: whether it may be tried again: its machine is gone, its controller was killed, or
         the process that it shared with others is. From other faults a job with processes of its
-        own goes on by itself.
+        own continues by itself.
       may_be_neighbours: whether a neighbour on its GPU may have caused it.
       is_out_of_memory: whether it found no memory on its GPU.
       again: why it is to be tried again without being counted; None: it is not.
@@ -54,7 +54,7 @@ class Running(Generic[J]):
       child_id: of the process on `host`.
       readers: of their metrics.
       started_s: when, by the clock of this process.
-      kill_at_s: when it is ended by force, by the clock of this process; None: it may go on.
+      kill_at_s: when it is ended by force, by the clock of this process; None: it may continue.
       was_urgent: whether it was asked to end as soon as it can.
       is_pruned: whether it was asked to end because others are better.
       is_retracted: whether that was because fewer are to run at once.

@@ -33,12 +33,12 @@ _FIRST_REPORT_S = 120.0
 
 
 class Scheduler(Generic[J]):
-    """Starts jobs where there is room, reads how far they are, and ends them on request.
+    """Starts jobs in free slots, reads how far they are, and ends them on request.
 
     A job that fails, or cannot be started, ends alone. But where it shared an MPS daemon, and the
     fault may have been that of another client, it is run once more, from its last checkpoint and
     alone on its GPU. Jobs with other faults that may pass, such as a machine that is gone, run
-    again, as often as their kind says.
+    again, as often as their kind allows.
 
     Args:
       jobs: those that are known; those that are `waiting` are run.
@@ -116,8 +116,8 @@ class Scheduler(Generic[J]):
                 continue
             if not self._sites_to_avoid(job):
                 return  # In order, so that a large job is not passed by forever.
-        has_room = self._slots.num_gpus_with_free_slot
-        while self._held.are_all(self._queue) and has_room() and (job := self._study.next()):
+        num_free = self._slots.num_gpus_with_free_slot
+        while self._held.are_all(self._queue) and num_free() and (job := self._study.next()):
             self._jobs.append(job)
             if self._held.has(job) or not self._start_if_it_fits(job):
                 self._queue.append(job)
@@ -126,7 +126,7 @@ class Scheduler(Generic[J]):
                 self._fail((job,), why)
 
     def _start_if_it_fits(self, job: J) -> bool:
-        """Starts a job if there is room; whether it has left the queue."""
+        """Starts a job if there is a slot for it; whether it has left the queue."""
         avoid = self._sites_to_avoid(job)
         if not (num_gpus := self._slots.num_gpus_with_free_slot(avoid)):
             return False

@@ -41,7 +41,7 @@ class Slot:
 
     @property
     def size(self) -> int:
-        """How many jobs it has room for."""
+        """How many jobs it can hold."""
         return 1 + len(self.merged)
 
     @property
@@ -82,18 +82,18 @@ def plan_slots(settings: JobsConfig, machine: Machine, backends: Collection[str]
       machine: where it is.
       backends: `plan.backend` of the jobs; where they differ each must bring its own.
     """
-    wanted: Any = next(iter(backends)) if len(backends) == 1 else "auto"
+    backend: Any = next(iter(backends)) if len(backends) == 1 else "auto"
     gpus, each = settings.gpus, settings.jobs_per_gpu
     if gpus is None:
         gpus = max(1, len(machine.gpus))
     try:
         count = 1 if each == "auto" else each
-        # Jobs plan their own GMIs; that the template is given keeps it out of what is said.
-        config = PlanConfig(gpus=gpus, gmis_per_gpu=count, backend=wanted, template="tcg")
+        # Jobs plan their own GMIs; a given template is not among the reasons that are printed.
+        config = PlanConfig(gpus=gpus, gmis_per_gpu=count, backend=backend, template="tcg")
         return make_plan(config, ReduceConfig(), 1, machine, template="tcg")
     except ConfigError as error:
-        said = str(error).replace("plan.gmis_per_gpu", f"{settings.prefix}jobs_per_gpu")
-        raise ConfigError(said.replace("plan.gpus", f"{settings.prefix}gpus")) from None
+        text = str(error).replace("plan.gmis_per_gpu", f"{settings.prefix}jobs_per_gpu")
+        raise ConfigError(text.replace("plan.gpus", f"{settings.prefix}gpus")) from None
 
 
 class Site(NamedTuple):
@@ -135,13 +135,13 @@ class SlotPool:
 
     def _open_slots(self, site: int) -> dict[int, list[Allocation]]:
         """Free slots by GPU, no more than its limit allows to be taken."""
-        found: dict[int, list[Allocation]] = {}
+        open_slots: dict[int, list[Allocation]] = {}
         for gpu, free in _by_gpu(self._free[site]).items():
-            all_of_it = len(self._all[site][gpu])
-            limit = self._limits.get((site, gpu), all_of_it)
-            if (room := limit - (all_of_it - len(free))) > 0:
-                found[gpu] = free[:room]
-        return found
+            total = len(self._all[site][gpu])
+            limit = self._limits.get((site, gpu), total)
+            if (num_open := limit - (total - len(free))) > 0:
+                open_slots[gpu] = free[:num_open]
+        return open_slots
 
     def acquire(
         self,
@@ -153,11 +153,11 @@ class SlotPool:
     ) -> Slot | None:
         """A slot on each of `num_gpus` GPUs of a machine, those with the most free ones.
 
-        With `alone` they are GPUs on which nobody else runs, now or until it is given back. The
-        machines of `avoid` are left out. None: not now. On one GPU it has room for up to
-        `num_jobs` jobs.
+        With `alone` they are GPUs on which no other job runs, now or until it is given back. The
+        machines of `avoid` are left out. None: not now. On one GPU it can hold up to `num_jobs`
+        jobs.
         """
-        found: list[tuple[int, list[list[Allocation]]]] = []
+        candidates: list[tuple[int, list[list[Allocation]]]] = []
         for site in sorted(self.left.difference(avoid)):
             by_gpu = self._open_slots(site)
             if alone:
@@ -165,10 +165,10 @@ class SlotPool:
                 by_gpu = {gpu: free[gpu] for gpu in by_gpu if free[gpu] == here[gpu]}
             emptiest = sorted(by_gpu.values(), key=len, reverse=True)[:num_gpus]
             if len(emptiest) == num_gpus:
-                found.append((site, emptiest))
-        if not found:
+                candidates.append((site, emptiest))
+        if not candidates:
             return None
-        site, emptiest = max(found, key=lambda one: sum(map(len, one[1])))
+        site, emptiest = max(candidates, key=lambda candidate: sum(map(len, candidate[1])))
         taken = tuple(free[0] for free in emptiest)
         # Of a GPU with MIG a job has one instance.
         rest = [

@@ -28,7 +28,7 @@ _MOST_RANDOM = 10
 
 
 class Study(Generic[J]):
-    """Hands out jobs, and is told what became of them; this one has none but those of the list."""
+    """Proposes jobs and gets their results (ask and tell); this one has none beside the list."""
 
     def next(self) -> J | None:
         """Another job; None: there is none, now or any more."""
@@ -79,7 +79,7 @@ class OptunaStudy(Study[J]):
             direction=settings.direction,
             pruner=_pruner(optuna, settings),
         )
-        # A command that goes on draws others than the first one did.
+        # A command that continues samples others than the first one did.
         study.sampler = _sampler(optuna, settings, settings.seed + len(study.trials))
         self._distributions = {key: _distribution(optuna, v) for key, v in space.items()}
         self._left = [trial for trial in study.trials if not trial.state.is_finished()]
@@ -130,9 +130,9 @@ class OptunaStudy(Study[J]):
         """See `Study`."""
         trial, progress = self._trials.get(job.number), job.progress
         if trial is None:
-            return False  # It has ended before, and goes on for more steps.
+            return False  # It has ended before, and continues for more steps.
         if not job.num_timesteps:
-            return False  # Nobody knows how far it is.
+            return False  # Its progress is unknown.
         report = _REPORTS * progress.env_steps // job.num_timesteps
         if progress.value is None or report <= self._reported.get(job.number, 0):
             return False
@@ -150,7 +150,7 @@ class OptunaStudy(Study[J]):
             value, state = None, self._states.PRUNED
         elif progress.state != "completed":
             if trial is not None:
-                self._wait(trial)  # The same sweep, run again, goes on with it.
+                self._wait(trial)  # The same sweep, run again, continues with it.
             return
         elif value is None or not self._is_comparable(job):
             value, state = None, self._states.FAIL

@@ -30,7 +30,7 @@ _KILL_AFTER_S: Final = 15.0
 """Beyond what a job gives its GMIs to save and end."""
 
 _ENDS_IF_ASKED: Final = (EXIT_INTERRUPTED, -signal.SIGINT, -signal.SIGTERM)
-"""A controller that still starts, or ends, does not yet, or no longer, hear the signal."""
+"""A controller that still starts, or that ends, does not handle the signal itself."""
 
 _ENDED_BY_GPU: Final = ("mps", "mig")
 """Backends where a fault of one job can end another."""

@@ -34,7 +34,7 @@ class SweepView:
       console: nothing is shown on a quiet one.
       jobs: those that are known; more may be added to the list.
       ranking: what they are compared by.
-      stopping: what is said of running jobs once a signal has come, whose name stands for `{}`.
+      stopping: the line about running jobs after a signal, whose name replaces `{}`.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class SweepView:
         return Group(self._table(), Text(self.line())) if self._display.has_panel else None
 
     def _print_changes(self) -> None:
-        """New stages of jobs; beside the table only those that somebody may have to mend."""
+        """New stages of jobs; beside the table only those that the user may have to fix."""
         for job in self._jobs:
             before = self._stages.get(job.number, ("waiting", 0, None))
             state, _, waits_for = now = job.progress.stage

@@ -1,4 +1,4 @@
-"""What a sweep says before its first job and after its last one."""
+"""What a sweep prints before its first job and after its last one."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def announce(
     work: Work[J],
     num_complete: int,
 ) -> None:
-    """Says how many jobs there are, of which some are complete, and where they run.
+    """Prints how many jobs there are, how many are complete, and where they run.
 
     Args:
-      console: where it is said.
+      console: where it is printed.
       sites: machines and their slots.
       work: the jobs, and where they come from.
       num_complete: jobs that an earlier command has completed.

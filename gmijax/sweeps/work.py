@@ -61,7 +61,7 @@ class Work(ABC, Generic[J]):
     """Of the command, and of its report."""
 
     resume_requirement: ClassVar[str]
-    """In words, what must be the same where a command goes on."""
+    """In words, what must be the same where a command continues."""
 
     def __post_init__(self) -> None:
         key, sampler = f"{self.settings.prefix}sampler", self.settings.sampler
@@ -104,7 +104,7 @@ class Work(ABC, Generic[J]):
         """Slots for the jobs.
 
         Raises:
-          ConfigError: there are no such GPUs, or no room for so many jobs.
+          ConfigError: there are no such GPUs, or the machine cannot run so many jobs.
         """
 
     @abstractmethod
@@ -151,10 +151,10 @@ class Work(ABC, Generic[J]):
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
-        """What must be the same where a command goes on."""
+        """What must be the same where a command continues."""
 
     def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
-        """What is to be said before the first job."""
+        """What is printed before the first job."""
         return ()
 
     def hint(self, report: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""The page in a browser: scene, panel, and who has it open. No jax here."""
+"""The page in a browser: scene, panel, and the clients that have it open. No jax here."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FORWARD, _LEFT = "forward_m_per_s", "left_m_per_s"
 
 
 class BrowserPage:
-    """Shows a simulation to everybody who has the page open.
+    """Shows a simulation to all clients that have the page open.
 
     Args:
       server: that it is served by.

@@ -39,7 +39,7 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 @dataclass(frozen=True)
 class Guard:
-    """Says of a request why it is refused.
+    """Decides which requests are refused.
 
     Attributes:
       host: where the server listens.
@@ -76,7 +76,7 @@ class Guard:
             return False
         if is_loopback(host) or host in {urlsplit(url).hostname for url in self.allowed_origins}:
             return True
-        # An address is no name that somebody else could have pointed here.
+        # An address is no name that another party could have pointed here.
         beyond = not is_loopback(self.host)
         return beyond and (_address(host) is not None or host in own_names(self.host))
 

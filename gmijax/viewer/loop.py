@@ -75,7 +75,7 @@ class Loop:
     """Runs a simulation at the wanted speed, and does what is asked of it.
 
     Args:
-      simulation: what is stepped; nobody else touches it.
+      simulation: what is stepped; nothing else touches it.
       page: what is drawn on.
       asked: requests (`gmijax.viewer.requests`), from any thread.
       run: the checkpoints of a run; None: there is only the policy of the simulation.
@@ -116,7 +116,7 @@ class Loop:
 
     @property
     def is_idle(self) -> bool:
-        """Whether nobody has looked for a while."""
+        """Whether no client has looked for a while."""
         return self._clock() - self._seen_client > IDLE_S
 
     def run(self) -> None:

@@ -73,7 +73,7 @@ class Panel:
             self._bars = self._gui.add_html("")
 
     def write(self, simulation: Simulation, view: View) -> None:
-        """Shows numbers, and what was changed by somebody else."""
+        """Shows numbers, and what another client has changed."""
         self._buttons.options = (_RUN if view.paused else _PAUSE, _STEP, _RESET)
         self._set(self._state, "content", state_html(view))
         self._set(self._bars, "content", bars_html(simulation.episodes[view.selected]))
@@ -132,7 +132,7 @@ class Panel:
             self._put(requests.SetCommand(None if drawn.value else tuple(command)))
 
         async def take(event: Any) -> None:
-            if event.client is not None:  # Moved by somebody, not by us.
+            if event.client is not None:  # Moved by a client, not by us.
                 drawn.value = False
                 await send_command(event)
 

@@ -26,7 +26,7 @@ def page(model: Any, trajectory: Trajectory) -> str:
     """
     num_steps, num_envs = trajectory.qpos.shape[:2]
     stride = max(1, round(1.0 / (trajectory.control_dt_s * MAX_FPS)))
-    # viser records what a server shows; nobody asks this one for anything.
+    # viser records what a server shows; no client connects to this one.
     server = open_server(Guard("127.0.0.1"), 0)
     try:
         scene = Scene(server, model, num_envs, has_ring=False)

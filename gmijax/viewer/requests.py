@@ -16,7 +16,7 @@ Point: TypeAlias = npt.NDArray[np.floating]
 
 
 class Pause(NamedTuple):
-    """Stop, or go on."""
+    """Stop, or continue."""
 
     paused: bool
 
@@ -88,7 +88,7 @@ class UseCheckpoint(NamedTuple):
 
 
 class Wake(NamedTuple):
-    """Somebody has opened the page."""
+    """A client has opened the page."""
 
 
 Request: TypeAlias = (

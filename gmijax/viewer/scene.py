@@ -114,7 +114,7 @@ class Scene:
         self._server.flush()
 
     def show_arrows(self, name: str, color: Color, arrows: Mapping[int, Arrow]) -> None:
-        """Draws arrows (from [3], to [3]) of environments in place of those of that name."""
+        """Draws arrows (from [3], to [3]) of environments; replaces those of that name."""
         handle = self._arrows.get(name)
         if not arrows:
             if handle is not None and handle.visible:
@@ -263,7 +263,7 @@ def is_fixed(model: Any, body: int) -> bool:
 
 
 def moving_robot(model: Any) -> int | None:
-    """The robot that may leave its place; None: there is none, or it is tied to the ground."""
+    """The robot that can move away; None: there is none, or it is fixed to the ground."""
     robot = free_robot(model)
     kinds = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
     ties = [one for one in range(model.neq) if model.eq_type[one] in kinds]

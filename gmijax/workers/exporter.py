@@ -40,7 +40,7 @@ def _run(link: ChildLink) -> None:
         write_bytes(paths.onnx, onnx_content(policy, metadata))
     if config.format in ("stablehlo", "all"):
         write_bytes(paths.stablehlo, stablehlo_content(policy))
-    # Written last: whoever sees it finds the others.
+    # Written last: a reader that sees it finds the others.
     write_json(paths.metadata, metadata)
 
 

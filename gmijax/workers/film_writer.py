@@ -61,11 +61,11 @@ def follow(run: RunPaths, is_over: threading.Event) -> None:
 
 def _listen(is_over: threading.Event) -> None:
     """Waits for the end of the job."""
-    said = b""
-    # Not by `sys.stdin`, whose lock Python wants when it ends.
+    received = b""
+    # Not by `sys.stdin`, whose lock Python needs when it ends.
     while part := os.read(sys.stdin.fileno(), len(FINISH)):
-        said += part
-    if said != FINISH:
+        received += part
+    if received != FINISH:
         os._exit(0)  # Also in the middle of a film.
     is_over.set()
 

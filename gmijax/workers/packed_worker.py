@@ -1,6 +1,6 @@
 """Main of a GMI that makes several runs in one program: `gmijax.workers.packed_worker`.
 
-Started by the supervisor and by nobody else. `MEMBERS_VARIABLE` names their run folders.
+Started by the supervisor only. `MEMBERS_VARIABLE` names their run folders.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def _run(folder: Path, seconds: float) -> None:
         "camera": choose_camera(env.model, config.camera).name,
         "policy": dict(policy.about),
     }
-    # Written last: whoever sees it finds the trajectory complete.
+    # Written last: a reader that sees it finds the trajectory complete.
     write_json(paths.returns, {**summarise(config, task, env_steps, episodes), **about})
 
 

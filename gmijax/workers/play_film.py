@@ -37,7 +37,7 @@ BRIEF_FPS, BRIEF_LEAST_FPS = 15.0, 12.5
 first: with fewer frames a second nothing is seen to move."""
 
 _TRIED = 3
-"""Pictures that are timed: somebody else may use the machine during one of them."""
+"""Pictures that are timed: another process may use the machine during one of them."""
 
 _H264_CRF = "20"
 _GIF_MAX_WIDTH = 480
@@ -122,7 +122,7 @@ def real_time(control_dt_s: float, max_fps: float) -> Timing:
 
 
 def grid_of(num_tiles: int) -> tuple[int, int]:
-    """Columns and rows of a grid, as square as possible, with room for `num_tiles`."""
+    """Columns and rows of a grid of at least `num_tiles`, as square as possible."""
     columns = math.ceil(math.sqrt(num_tiles))
     return columns, math.ceil(num_tiles / columns)
 
@@ -134,7 +134,7 @@ def tile_size(width: int, height: int, grid: tuple[int, int]) -> tuple[int, int]
 
 
 def compose(tiles: list[Image], grid: tuple[int, int]) -> Image:
-    """The tiles side by side, row by row; places without a tile are black."""
+    """The tiles side by side, row by row; cells without a tile are black."""
     columns, rows = grid
     tiles = tiles + [np.zeros_like(tiles[0])] * (columns * rows - len(tiles))
     strips = [np.concatenate(tiles[row * columns : (row + 1) * columns], 1) for row in range(rows)]

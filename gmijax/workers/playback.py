@@ -58,8 +58,8 @@ def _run(link: ChildLink) -> None:
         "camera": camera,
     }
     outcome = summarise(config, env.spec.name, env_steps, episodes)
-    # After the trajectory: whoever sees it finds that complete. Before the walking test, which
-    # may fail.
+    # After the trajectory, so that a reader that sees this file finds that one complete. Before
+    # the walking test, which may fail.
     write_json(paths.returns, {**outcome, **about})
     if (robot := robot_of(env_config)) is not None:
         about["walking"] = _walk(config, env_config, robot, impl, link, learner, state)
@@ -112,7 +112,7 @@ def _walk(
 
 
 def _impl(config: PlayConfig, checkpoint: Path, env_config: EnvConfig) -> str:
-    """The MJX to play with; says why."""
+    """The MJX to play with; prints why."""
     import jax
 
     from gmijax.sim.impl import choose_impl, impl_of_policy

@@ -66,7 +66,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
             *(config, link, env, policy, rank, first, num_unrolls, writer),
             barrier=lambda: comm.all_gather(np.zeros(1, np.float32)),
         )
-        # The template says where what this GMI does is written.
+        # The template decides where what this GMI does is written.
         result = import_module(_TEMPLATES[plan.template]).collect(context, plan)
     written = {} if writer is None else {"shards": writer.num_written, "bytes": writer.num_bytes}
     return {

@@ -23,8 +23,8 @@ from gmijax.runs.folder import read_json
 
 
 def main(order: Path, lifeline_fd: int) -> int:
-    """Trains as the file `order` says; returns the exit code of `gmijax.train`."""
-    # A shell may have had the sweep ignore it; it comes from nobody but the sweep here.
+    """Trains as the file `order` describes; returns the exit code of `gmijax.train`."""
+    # A shell may have made the sweep ignore it; only the sweep sends it here.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     threading.Thread(target=_end_with_the_sweep, args=(lifeline_fd,), daemon=True).start()
     data = read_json(order)

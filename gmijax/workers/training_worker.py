@@ -1,6 +1,6 @@
 """Main of a GMI in training: `python -m gmijax.workers.training_worker`.
 
-Started by the supervisor and by nobody else. Reads the run folder, does what the plan gives to
+Started by the supervisor only. Reads the run folder, does what the plan gives to
 this GMI, and writes `result.json` or `error.json`.
 
 With the template `tdg_ex` one GMI of every GPU trains and the others make its rollouts; in
@@ -183,14 +183,14 @@ def _run_asynchronous(
     num_averaged = exchange_size(env.spec, config.algo, A3cLosses)
     comm = _trainers_communicator(config, plan, trainers, link, num_averaged, nodes, listener)
     if listener is not None:
-        listener.close()  # Trainers that are all on one node do not meet others.
+        listener.close()  # Trainers that are all on one node connect to no others.
     held.callback(comm.close)
     trainer = Trainer(config, env, agents.gmis, registers, receiver, comm, link)
     return trainer.run() | exchange_used(plan, comm)
 
 
 def _topology(plan: Plan, trainers: Group, nodes: NodeAddresses | None) -> ChannelTopology:
-    """Who sends experience to whom, and to which address on another node."""
+    """Which agent sends experience to which trainer, and to which address on another node."""
     topology = topology_of(plan)
     if nodes is None:
         return topology
@@ -220,7 +220,7 @@ def _trainers_communicator(
     nodes: NodeAddresses | None,
     listener: socket | None,
 ) -> Communicator:
-    """The communicator among the trainers, whose ranks are their places in the group.
+    """The communicator among the trainers, whose ranks are their positions in the group.
 
     It averages `num_averaged` float32 in every update: a gradient and the parts of the loss.
     """
@@ -238,7 +238,7 @@ def _trainers_communicator(
         rendezvous_timeout_s=config.run.start_timeout_s,
         intra=plan.intra,
         inter=plan.inter,
-        # Whoever asks for it by name gets an error that it does not work.
+        # If it is requested by name, the error is that it does not work.
         host_if_unavailable=config.reduce.strategy != "one_shot",
         nodes=nodes,
         listener=listener,

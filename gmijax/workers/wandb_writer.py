@@ -70,16 +70,16 @@ def _open(run: RunPaths, config: Mapping[str, Any], board_id: str) -> Any:
     """The run at Weights & Biases."""
     import wandb
 
-    said = config["wandb"]
+    settings = config["wandb"]
     return wandb.init(
         id=board_id,
         resume="allow",
         name=run.root.name,
-        project=said["project"],
-        group=said["group"],
+        project=settings["project"],
+        group=settings["group"],
         config=dict(config),
         dir=run.root,
-        settings=wandb.Settings(mode=said["mode"], silent=True, console="off"),
+        settings=wandb.Settings(mode=settings["mode"], silent=True, console="off"),
     )
 
 

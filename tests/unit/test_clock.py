@@ -140,7 +140,7 @@ class ScriptedGmi(WatchedGmi):
     def poll(self) -> int | None:
         self._polls += 1
         if self._polls == 1:
-            self._heard(1, Heartbeat(self._state, 1, self.pid))
+            self._record_heartbeat(1, Heartbeat(self._state, 1, self.pid))
         if self._polls >= 10 and self.exit_code is None:
             self.exit_code = 0
         return self.exit_code

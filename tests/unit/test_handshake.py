@@ -97,7 +97,7 @@ def test_both_ends_learn_that_the_other_knows_the_key(listener: socket.socket) -
 def test_who_proves_nothing_is_hung_up_on_and_keeps_nobody_out(
     kind: str, leaves: bool, listener: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(handshake, "STRANGER_S", 0.2)
+    monkeypatch.setattr(handshake, "PROOF_TIMEOUT_S", 0.2)
     with stranger(listener, SENT[kind]) as other:
         if leaves:
             other.shutdown(socket.SHUT_WR)
@@ -111,7 +111,7 @@ def test_who_proves_nothing_is_hung_up_on_and_keeps_nobody_out(
 def test_who_sends_a_byte_now_and_then_has_no_more_time_than_others(
     listener: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(handshake, "STRANGER_S", 0.3)
+    monkeypatch.setattr(handshake, "PROOF_TIMEOUT_S", 0.3)
     with stranger(listener) as other:
         started_s = time.monotonic()
         hearing = threading.Thread(target=first, args=(listener, 2.0))
@@ -193,9 +193,9 @@ def test_many_silent_ones_keep_nobody_out_and_few_are_held(listener: socket.sock
             connection, caller = next(callers)
             held.callback(connection.close)
             assert caller == CALLER
-            assert time.monotonic() - started_s < handshake.STRANGER_S
+            assert time.monotonic() - started_s < handshake.PROOF_TIMEOUT_S
             waiting = [one for one in others if not is_hung_up_on(one, 0.001)]
-            assert len(waiting) <= handshake.MAX_STRANGERS
+            assert len(waiting) <= handshake.MAX_UNAUTHENTICATED
         thread.join()
         assert all(is_hung_up_on(one) for one in others)
 

@@ -278,7 +278,7 @@ def test_a_strangers_daemon_is_not_used(
     owner: int, is_used: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     if os.geteuid() != 0:
-        monkeypatch.setattr(machine_module, "strange_owner", lambda _: None if is_used else owner)
+        monkeypatch.setattr(machine_module, "foreign_owner", lambda _: None if is_used else owner)
     pipe = tmp_path / "nvidia-mps"
     pipe.mkdir()
     if os.geteuid() == 0:
@@ -307,7 +307,7 @@ def test_a_link_of_a_strangers_to_a_directory_of_roots_is_not_used(tmp_path: Pat
     real, link = tmp_path / "real", tmp_path / "link"
     real.mkdir()
     link.symlink_to(real)
-    assert machine_module.strange_owner(link) is None
+    assert machine_module.foreign_owner(link) is None
     if os.geteuid() == 0:
         os.chown(link, 4321, -1, follow_symlinks=False)
-        assert machine_module.strange_owner(link) == 4321
+        assert machine_module.foreign_owner(link) == 4321

@@ -94,7 +94,7 @@ def test_jobs_are_told_that_experience_could_stay_on_the_gpu(
     assert any("channel.transport=device keeps" in why for why in plan.reasons) == is_told
     if "plan.serving_gpus=1" in overrides:
         config = compose(*share, *overrides, "channel.transport=device")
-        with pytest.raises(ConfigError, match="agent 1 is on GPU 0 of the job, where nobody tr"):
+        with pytest.raises(ConfigError, match="agent 1 is on GPU 0 of the job, where no GMI tr"):
             training_plan(config, here)
 
 

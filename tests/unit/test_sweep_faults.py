@@ -492,10 +492,10 @@ def test_room_is_kept_for_the_end_of_a_sweep(
     files = JobsReport(ended_job(), SweepConfig(), dict, paths, OpenFolder(paths.root, "x"), 0.0)
     files.begin()
     assert read_json(paths.sweep)["status"] == "running"
-    assert paths.room.stat().st_blocks * 512 >= 2 * paths.sweep.stat().st_size
+    assert paths.reserve.stat().st_blocks * 512 >= 2 * paths.sweep.stat().st_size
 
     def while_there_is_room(write: Callable[..., None]) -> Callable[..., None]:
-        return lambda *args: full() if paths.room.exists() else write(*args)
+        return lambda *args: full() if paths.reserve.exists() else write(*args)
 
     for name in ("write_json", "write_text"):
         monkeypatch.setattr(report, name, while_there_is_room(getattr(report, name)))
@@ -508,7 +508,7 @@ def test_room_is_kept_for_the_end_of_a_sweep(
     assert read_json(paths.sweep)["status"] == "failed"
     assert paths.table.exists()
     assert paths.curves.read_bytes() == before  # The old picture is whole.
-    assert not paths.room.exists()
+    assert not paths.reserve.exists()
 
 
 def run(*overrides: str) -> int:

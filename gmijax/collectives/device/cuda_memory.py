@@ -52,7 +52,7 @@ class CudaMemory:
         )
         self.address, self._is_owner = int(pointer), True
         result = runtime.cudaIpcGetMemHandle(self.address)
-        if result[0] != runtime.cudaError_t.cudaSuccess:  # Nobody has mapped it.
+        if result[0] != runtime.cudaError_t.cudaSuccess:  # No process has mapped it.
             runtime.cudaFree(self.address)
             self.address = 0
         (handle,) = checked(result, "share GPU memory with other processes")

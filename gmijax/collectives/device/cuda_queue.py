@@ -69,13 +69,13 @@ class CudaQueue:
         checked(runtime.cudaMemsetAsync(target, 0, num_bytes, stream), "clear memory")
 
     def raise_flag(self, stream: int, rank: int, count: int) -> None:
-        """Sets a flag when all before it is done, and seen by who sees the flag."""
+        """Sets a flag once all work before it is done and visible to readers of the flag."""
         # No flags: with the barrier that makes what was written before visible to all.
         flag = self._flags + rank * self._line_bytes
         _queued(driver.cuStreamWriteValue32(stream, flag, count, 0), "write")
 
     def wait_for_flag(self, stream: int, rank: int, count: int) -> None:
-        """Holds the stream until a flag has come to `count`."""
+        """Holds the stream until a flag has reached `count`."""
         flag = self._flags + rank * self._line_bytes
         _queued(driver.cuStreamWaitValue32(stream, flag, count, self._wait), "wait for")
 
@@ -108,31 +108,31 @@ class CudaQueue:
 
 
 def _wait_flags() -> int:
-    """How to wait for a flag that says that other GPUs have written into memory of this one."""
+    """How to wait for a flag that other GPUs set after writing into memory of this one."""
     can_flush = runtime.cudaDeviceAttr.cudaDevAttrCanFlushRemoteWrites
     (is_able,) = checked(runtime.cudaDeviceGetAttribute(can_flush, 0), "ask what the GPU can do")
     flags = driver.CUstreamWaitValue_flags
     wait = int(flags.CU_STREAM_WAIT_VALUE_GEQ.value)
-    # What came over PCIe before the flag did may yet be on its way to who reads it here.
+    # Data sent over PCIe before the flag may not have arrived when the flag has.
     return wait | int(flags.CU_STREAM_WAIT_VALUE_FLUSH.value) if is_able else wait
 
 
-def checked(result: tuple[Any, ...], wish: str) -> tuple[Any, ...]:
-    """What a call of the runtime returned, but for its error code.
+def checked(result: tuple[Any, ...], action: str) -> tuple[Any, ...]:
+    """What a call of the runtime returned, without its error code.
 
     Raises:
-      CudaError: there was one; the message says that one cannot `wish`.
+      CudaError: it is an error; the message is "cannot `action`", and the error.
     """
     code, *values = result
     if code != runtime.cudaError_t.cudaSuccess:
         message = runtime.cudaGetErrorString(code)[1].decode()
-        raise CudaError(f"cannot {wish}: {code.name}: {message}")
+        raise CudaError(f"cannot {action}: {code.name}: {message}")
     return tuple(values)
 
 
-def _queued(result: tuple[Any, ...], wish: str) -> None:
+def _queued(result: tuple[Any, ...], action: str) -> None:
     if result[0] != driver.CUresult.CUDA_SUCCESS:
-        raise CudaError(f"cannot {wish} a flag on the stream: {result[0].name}")
+        raise CudaError(f"cannot {action} a flag on the stream: {result[0].name}")
 
 
 def _event() -> Any:
@@ -143,7 +143,7 @@ def pinned(num_floats: int) -> npt.NDArray[np.float32]:
     """New memory of the host, [n], that the GPU reads and writes by itself.
 
     Copies from and to other memory go through a buffer of the driver, piece by piece. It is
-    released with the last array of it: who is interrupted may leave a thread that still uses it.
+    released with the last array of it: an interrupted call may leave a thread that still uses it.
     """
     allocated = runtime.cudaHostAlloc(4 * num_floats, runtime.cudaHostAllocPortable)
     (address,) = checked(allocated, "pin memory of the host")
@@ -153,7 +153,7 @@ def pinned(num_floats: int) -> npt.NDArray[np.float32]:
 
 
 def fetch(stream: int, source: int, target: npt.NDArray[np.float32]) -> None:
-    """Copies [n] float32 of the device to `target`, once the stream has come to it."""
+    """Copies [n] float32 of the device to `target`, after the work queued on the stream."""
     kind = runtime.cudaMemcpyKind.cudaMemcpyDeviceToHost
     copied = runtime.cudaMemcpyAsync(target.ctypes.data, source, target.nbytes, kind, stream)
     checked(copied, "copy from the GPU")

@@ -1,4 +1,4 @@
-"""Memory of a GPU that several processes map, for those who need neither jax nor CUDA."""
+"""Memory of a GPU that several processes map, for modules that need neither jax nor CUDA."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ IPC_HANDLE_BYTES = 64
 
 
 class DeviceMemory(Protocol):
-    """A block of memory: `CudaMemory`, or what a test puts in its place."""
+    """A block of memory: `CudaMemory`, or the fake of a test."""
 
     @property
     def address(self) -> int:

@@ -42,7 +42,7 @@ class IpcBuffers:
       members: ranks that have slots in each block; this one among them.
       owners: ranks that make the blocks which this one writes; the first one's is on its own GPU.
       new_memory: how the processes share a block.
-      wish: what cannot be had if this fails, for the message.
+      what: what is unavailable if this fails, for the message.
 
     Raises:
       DeviceMemoryUnavailable: there is no such memory here; on all ranks alike.
@@ -56,7 +56,7 @@ class IpcBuffers:
         members: Sequence[int],
         owners: Sequence[int],
         new_memory: NewMemory,
-        wish: str,
+        what: str,
     ) -> None:
         self._row_bytes = -(-num_floats // FLOATS_PER_ROW_UNIT) * FLOATS_PER_ROW_UNIT * 4
         here = host.local
@@ -67,9 +67,9 @@ class IpcBuffers:
         self._host: SharedMemoryGroup | None = here
         here.flags[here.rank, 1] = 0
         try:
-            of_job = all_or_none(host, wish, lambda: self._make(new_memory))
+            of_job = all_or_none(host, what, lambda: self._make(new_memory))
             ipc_handles = of_job[host.rank - here.rank :][: here.world_size]
-            all_or_none(host, wish, lambda: self._map(ipc_handles))
+            all_or_none(host, what, lambda: self._map(ipc_handles))
         except BaseException:
             self.close()
             raise

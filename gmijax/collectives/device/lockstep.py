@@ -28,7 +28,7 @@ class LockstepRunner:
 
     @property
     def is_caught(self) -> bool:
-        """Whether the device may be at something that a peer has not come to."""
+        """Whether the device may be in an exchange that a peer has not reached."""
         return self._thread.is_stuck or self._is_running
 
     def step(self, program: Callable[[], T]) -> T:

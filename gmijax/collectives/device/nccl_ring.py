@@ -10,7 +10,7 @@ from typing import Any
 from gmijax.collectives.all_or_none import Group, all_or_none
 from gmijax.collectives.strategies import Groups
 
-_WISH = "rings between GPUs"
+_FEATURE = "rings between GPUs"
 
 
 class NcclRing:
@@ -40,12 +40,12 @@ class NcclRing:
     def close(self) -> None:
         """Gives the communicator back, at once if an error is what ends it. Idempotent.
 
-        What NCCL then says of the communicator is not news: who waited for a sum has heard it.
+        Errors that NCCL then reports are ignored: callers that wait for a sum have seen them.
         """
         comm, self._comm = self._comm, None
         if comm is None:
             return
-        # To destroy one may wait for the other members, of whom some may not have joined.
+        # To destroy one may wait for the other members, some of which may not have joined.
         give_back = self._nccl.comm_destroy if sys.exception() is None else self._nccl.comm_abort
         with suppress(Exception):
             give_back(comm)
@@ -67,7 +67,8 @@ def nccl_ring(group: Group, rings: Groups) -> NcclRing | None:
     def make_id() -> bytes:
         if not members:
             return b""
-        nccl = _nccl()  # By all members: who cannot import it must not leave others in `join`.
+        # By all members: one that cannot import it must not leave others waiting in `join`.
+        nccl = _nccl()
         return bytes(nccl.get_unique_id()) if members[0] == rank else b""
 
     def join() -> bytes:
@@ -78,9 +79,9 @@ def nccl_ring(group: Group, rings: Groups) -> NcclRing | None:
             joined.append(NcclRing(nccl, comm))
         return b""
 
-    ids = all_or_none(group, _WISH, make_id)
+    ids = all_or_none(group, _FEATURE, make_id)
     try:
-        all_or_none(group, _WISH, join)
+        all_or_none(group, _FEATURE, join)
     except BaseException:
         for ring in joined:
             ring.close()

@@ -36,7 +36,7 @@ class OtherNodes(Protocol):
     """The leaders of other nodes, as the leader of this one sees them: `LeaderWatch`."""
 
     def beat(self) -> None:
-        """Tells them that this node waits; called five times a second in every wait."""
+        """Sends them a heartbeat: this node waits. Called five times a second in every wait."""
         ...
 
     def look(self, since_s: float, timeout_s: float, operation: str, step: int) -> None:
@@ -67,13 +67,13 @@ class Barrier:
         self.arrive()
 
     def restart(self) -> None:
-        """Says that the calls so far belong to the start: the next one is the first."""
+        """Marks the calls so far as part of the start: the next one is the first."""
         self._first_step = self.step + 1
 
     def begin(self, operation: str, count: int, call_index: int = 0) -> None:
         """Opens a call of `operation` (see `OPERATIONS`) with `count` floats; `end` closes it.
 
-        `call_index` says which exchange of its program it is.
+        `call_index` is the number of the exchange in its program.
 
         Raises:
           CollectiveError: an earlier call failed, or (first call only) ranks attached with
@@ -114,7 +114,7 @@ class Barrier:
 
         Returns when `done` is set. Devices of ranks that have come out of the step may still be
         at it, so all peers are looked at, and time only counts while one of them is unresponsive.
-        If all are caught in it, the controller will see that nothing goes on.
+        If all are stuck in it, the controller will see that there is no progress.
 
         Raises:
           PeerLost: the process of a peer is gone.
@@ -129,7 +129,7 @@ class Barrier:
 
     @contextmanager
     def raise_peer_failure(self) -> Iterator[None]:
-        """If a step fails because a peer has ended or is unresponsive, says so.
+        """Replaces the error of a step by that of a peer that has ended or is unresponsive.
 
         Raises:
           PeerLost, CollectiveTimeout: see `watch`; an error that no peer explains stays as it is.
@@ -161,7 +161,7 @@ class Barrier:
         self._is_open = False
 
     def leave(self) -> None:
-        """Tells the others that this rank will not come again."""
+        """Marks this rank as gone: it makes no further calls."""
         self._block.lines["pid"][self._block.rank] = 0
 
     @property
@@ -184,7 +184,7 @@ class Barrier:
             detector.give_up(unresponsive)
 
     def arrive(self) -> None:
-        """Arrives, and waits for nobody."""
+        """Arrives, without waiting."""
         self._fence()
         self._sequence[self._block.rank] += 1
 

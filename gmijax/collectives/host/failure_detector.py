@@ -1,8 +1,8 @@
 """Finds which peer is dead or stuck when a rank has waited too long.
 
 A rank that waits raises its `heartbeats` now and then. So at a timeout a peer that only waits too
-is not mistaken for one that is stuck, wherever each of them waits. A rank that gives up notes whom
-it waited for, its `suspect`, so that its own end is not taken for the cause.
+is not mistaken for one that is stuck, wherever each of them waits. A rank that gives up records
+the peer it waited for, its `suspect`, so that its own end is not taken for the cause.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class FailureDetector:
         self._step = step
         self._timeout_s = timeout_s
         self._start_s = self._clock_s = running_s()
-        self._heard: dict[int, tuple[int, float]] = {}
+        self._last_heartbeats: dict[int, tuple[int, float]] = {}
 
     @property
     def is_late(self) -> bool:
@@ -41,11 +41,11 @@ class FailureDetector:
         return self._waited_s() >= self._timeout_s
 
     def look(self, missing: Callable[[], list[int]], *, while_unresponsive: bool = False) -> None:
-        """Looks at those who are missing; to be called five times a second.
+        """Checks the ranks that are missing; to be called five times a second.
 
         Args:
           missing: ranks that have not arrived, read anew at every call.
-          while_unresponsive: the time starts anew while all who are missing are heard of.
+          while_unresponsive: the time starts anew while all missing ranks send heartbeats.
 
         Raises:
           PeerLost: the process of one of them is gone.
@@ -62,7 +62,7 @@ class FailureDetector:
             self.give_up(left)
 
     def give_up(self, missing: list[int]) -> NoReturn:
-        """Raises CollectiveTimeout for those of `missing` who do not wait themselves.
+        """Raises CollectiveTimeout for those of `missing` that do not wait themselves.
 
         A rank that has given up and is still ending is unresponsive too, and not the cause.
         """
@@ -70,9 +70,9 @@ class FailureDetector:
         self._raise_timeout([peer for peer in peers if not self._block.suspect[peer]] or peers)
 
     def unresponsive(self, missing: list[int]) -> list[int]:
-        """Those of `missing` who do not wait themselves, as far as this rank has heard."""
+        """Those of `missing` without a recent heartbeat, which do not wait themselves."""
         since_s, never = running_s() - SILENCE_S, (0, self._start_s)
-        return [peer for peer in missing if self._heard.get(peer, never)[1] < since_s]
+        return [peer for peer in missing if self._last_heartbeats.get(peer, never)[1] < since_s]
 
     def _check_alive(self, missing: Callable[[], list[int]]) -> None:
         gone = [peer for peer in missing() if self._is_gone(peer)]
@@ -101,8 +101,8 @@ class FailureDetector:
     def _listen(self) -> None:
         now_s = running_s()
         for peer, heartbeats in enumerate(self._block.lines["heartbeats"].tolist()):
-            if self._heard.get(peer, (None,))[0] != heartbeats:
-                self._heard[peer] = heartbeats, now_s
+            if self._last_heartbeats.get(peer, (None,))[0] != heartbeats:
+                self._last_heartbeats[peer] = heartbeats, now_s
 
     def _raise_lost(self, peer: int) -> NoReturn:
         self._block.suspect[self._block.rank] = peer + 1

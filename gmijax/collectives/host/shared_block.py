@@ -1,9 +1,9 @@
 """The block of shared memory through which the GMIs of one host exchange numbers.
 
 The controller makes an anonymous file (`create_exchange`); its GMIs inherit the descriptor and
-map the file (`attach`). The file has no name, so nothing is left behind whoever gets killed, and
-it does not count against the size of /dev/shm. `docs/decisions/shared-memory-exchange.md` says
-why, and which guarantees about memory order the protocol needs.
+map the file (`attach`). The file has no name, so nothing is left behind whichever process is
+killed, and it does not count against the size of /dev/shm. The reasons, and the guarantees about
+memory order that the protocol needs, are in `docs/decisions/shared-memory-exchange.md`.
 
 This file is the only one that knows the wire format (K ranks, P floats, native byte order):
 
@@ -54,15 +54,15 @@ class SharedBlock(NamedTuple):
     """The mapped block as arrays; the mapping lives as long as one of them does.
 
     Attributes:
-      rank: whose view this is.
+      rank: the one that has this view.
       lines: [K] of `LINE`, of one lane.
       suspect: [K] uint64, 1 + the rank for which each has given up, in any lane; 0: it has not.
       gathered: [2, K, MAX_GATHER_FLOATS] float32, of the same.
       slots: [2, K, P] float32, used in turn.
       flags: [whole pages, FLOATS_PER_LINE] uint32, of which [rank, 0] counts how often the device
-        of a rank has written its slots; 1 says that the rank is through with slots in device
-        memory, and 2 to 3 which exchanges it has come to (`device_transport.DesyncDetector`).
-      ids: of the ranks' GMIs in the job, for what is said of lost peers: not all GMIs need have a
+        of a rank has written its slots; 1 is set once the rank is done with slots in device
+        memory, and 2 to 3 are the exchanges it has reached (`device_transport.DesyncDetector`).
+      ids: of the ranks' GMIs in the job, for messages about lost peers: not all GMIs need have a
         rank, and with several nodes each has a block.
     """
 
@@ -93,9 +93,9 @@ def attach(
 ) -> SharedBlock:
     """Maps the block and makes this process known as `rank`.
 
-    The block gets its size here, from whoever comes first; the caller keeps `fd` and may close
-    it at once. Ranks that attach with other numbers are found out in their first call. For the
-    arguments see `SharedMemoryGroup`.
+    The block gets its size here, from the first rank to attach; the caller keeps `fd` and may
+    close it at once. Ranks that attach with other numbers are detected in their first call. For
+    the arguments see `SharedMemoryGroup`.
 
     Raises:
       CollectiveError: no memory, not such a descriptor, or the rank is taken.

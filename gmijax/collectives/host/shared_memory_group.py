@@ -30,7 +30,7 @@ class SharedMemoryGroup:
     those that are in none of the groups. Results are bit-identical on the members of a group.
 
     A rank uses its two slots in turn. It writes one again in the call after the next one; by then
-    it has met all others in between, who came there after reading what this call left.
+    all others have passed a barrier in between, after reading what this call left.
 
     Args:
       fd: descriptor of the shared block; the caller may close it afterwards.
@@ -39,7 +39,7 @@ class SharedMemoryGroup:
       num_floats: P, length of the largest buffer.
       timeout_s: longest wait for other ranks.
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
-      lane: of the block; those who use one thread of calls each take a lane each.
+      lane: of the block; each thread that makes calls takes a lane of its own.
       ids: see `SharedBlock`; None: those of the GMIs are their ranks.
 
     Raises:
@@ -79,7 +79,7 @@ class SharedMemoryGroup:
         slots, group = self._shared("sum", source, groups, call_index)
         if group:
             part = chunk(source.size, group.index(self.rank), len(group))
-            # In place: nobody else reads this part of the first member's slot.
+            # In place: no other rank reads this part of the first member's slot.
             _add(slots, group, part)
         self.barrier.wait()
         target[:] = slots[group[0] if group else self.rank]
@@ -153,7 +153,7 @@ class SharedMemoryGroup:
         return not process_of(self._open_block("is_gone").lines[peer]).is_running()
 
     def heartbeat(self) -> None:
-        """Tells the others that this rank waits, for somebody who is not in this block."""
+        """Signals the others that this rank waits for a rank outside this block."""
         self._open_block("heartbeat").lines["heartbeats"][self.rank] += 1
 
     def close(self) -> None:

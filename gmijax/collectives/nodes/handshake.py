@@ -1,17 +1,19 @@
 """How two processes of a job prove to each other over TCP that both know the job's token.
 
-A listener is open to everybody on the network, so strangers cost it little: all are heard at once,
-each has two seconds in all, and beyond a few the oldest is hung up on. Whoever is not let in calls
-again. What is sent after the handshake is neither encrypted nor signed.
+A listener is open to the whole network, so unauthenticated clients must cost it little: all are
+read concurrently, each has two seconds in all, and beyond a limit the oldest is disconnected. A
+caller that is disconnected connects again. What is sent after the handshake is neither encrypted
+nor signed.
 
 | step | caller sends | listener sends |
 |---|---|---|
 | 1 | 32 random bytes | 32 random bytes |
-| 2 | who it is (8 bytes), and an HMAC | |
+| 2 | its identity (8 bytes), and an HMAC | |
 | 3 | | an HMAC, once that of the caller is right |
 
-The HMAC (SHA-256, under the token) is of the role, who calls, both random numbers, and which
-listener this is: what was sent once, elsewhere or by the other end proves nothing.
+The HMAC (SHA-256, under the token) covers the role (the bytes `calls` or `hears`), the identity of
+the caller, both random numbers, and the name of the listener: what was sent once, elsewhere or by
+the other end proves nothing.
 """
 
 from __future__ import annotations
@@ -29,31 +31,33 @@ from typing import Final, NamedTuple, TypeAlias
 from gmijax.clock import running_s
 from gmijax.collectives.waits import LIVENESS_PERIOD_S
 
-STRANGER_S: Final = 2.0
+PROOF_TIMEOUT_S: Final = 2.0
 """How long a caller has from its connection to its proof."""
 
-MAX_STRANGERS: Final = 16
-"""Callers without proof that a listener hears at once; each takes a descriptor."""
+MAX_UNAUTHENTICATED: Final = 16
+"""Unauthenticated clients that a listener holds at a time; each takes a descriptor."""
 
 _CONNECT_S: Final = 1.0  # No longer, or the clock stands still.
 _RETRY_S: Final = 0.1
 _PAUSE_S: Final = 0.01
 _ACCEPTED_AT_ONCE: Final = 4
+_CALLS: Final = b"calls"
+_HEARS: Final = b"hears"  # The listener's; both are part of the protocol.
 _CALLER: Final = struct.Struct("<II")
 _NONCE_BYTES = _PROOF_BYTES = 32
 _CALL_BYTES: Final = _NONCE_BYTES + _CALLER.size + _PROOF_BYTES
 _KEEP_ALIVE: Final = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 5, socket.TCP_KEEPCNT: 6}
-"""A machine that is gone is noticed after some forty seconds, if nothing is on the way to it."""
+"""A machine that is gone is noticed after some forty seconds, if nothing is being sent to it."""
 
 Caller: TypeAlias = tuple[int, int]
-"""Who calls: two numbers whose meaning is up to those who use this."""
+"""Identity of a caller: two numbers whose meaning is up to the user of this module."""
 
 TimeLeft: TypeAlias = Callable[[], float]
-"""Seconds that may still be waited; asked five times a second."""
+"""Seconds that may still be waited; called five times a second."""
 
 
 class Unreachable(ConnectionError):
-    """There is no way to the address, or nobody listens there."""
+    """There is no route to the address, or no process listens there."""
 
 
 class Key(NamedTuple):
@@ -68,7 +72,7 @@ class Key(NamedTuple):
     listener: str
 
     def proof(self, role: bytes, caller: bytes, nonces: bytes) -> bytes:
-        """Proves that the end with this role, `calls` or `hears`, knows the key."""
+        """Proves that the end with this role knows the key."""
         message = role + caller + nonces + self.listener.encode()
         return hmac.digest(self.token, message, "sha256")
 
@@ -86,7 +90,7 @@ def call(address: tuple[str, int], key: Key, caller: Caller, time_left: TimeLeft
             _prove(connection, key, _CALLER.pack(*caller), time_left)
             return _ready(connection)
         except ConnectionError:
-            # It may have hung up because too many strangers call.
+            # The listener may have too many unauthenticated clients.
             connection.close()
             if time_left() <= _RETRY_S:
                 raise
@@ -99,31 +103,31 @@ def call(address: tuple[str, int], key: Key, caller: Caller, time_left: TimeLeft
 def accepted(
     listener: socket.socket, key: Key, time_left: TimeLeft
 ) -> Generator[tuple[socket.socket, Caller], None, None]:
-    """Connections with those who know the key, as they come, until the time is up."""
-    strangers = _Strangers(listener, key)
+    """Connections with callers that know the key, as they come, until the time is up."""
+    clients = _UnauthenticatedClients(listener, key)
     try:
         while (left_s := time_left()) > 0:
-            yield from strangers.hear(min(left_s, LIVENESS_PERIOD_S))
+            yield from clients.poll(min(left_s, LIVENESS_PERIOD_S))
     finally:
-        strangers.close()
+        clients.close()
 
 
-class _Strangers:
-    """Callers that have not proved anything yet, in the order in which they came."""
+class _UnauthenticatedClients:
+    """Callers that have not proved anything yet, in the order in which they connected."""
 
     def __init__(self, listener: socket.socket, key: Key) -> None:
         self._listener, self._key = listener, key
-        self._callers: dict[socket.socket, _Stranger] = {}
+        self._clients: dict[socket.socket, _UnauthenticatedClient] = {}
         self._selector = selectors.DefaultSelector()
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ)
 
-    def hear(self, timeout_s: float) -> Iterator[tuple[socket.socket, Caller]]:
-        """Hears those who have sent something, drops the late ones, and accepts new ones."""
-        found = {key.fileobj for key, _ in self._selector.select(timeout_s)}
-        for connection in [one for one in self._callers if one in found]:
+    def poll(self, timeout_s: float) -> Iterator[tuple[socket.socket, Caller]]:
+        """Reads what clients have sent, drops those that are late, and accepts new ones."""
+        readable = {key.fileobj for key, _ in self._selector.select(timeout_s)}
+        for connection in [client for client in self._clients if client in readable]:
             try:
-                caller = self._callers[connection].hear()
+                caller = self._clients[connection].receive()
             except OSError:
                 self._drop(connection)
                 continue
@@ -131,19 +135,19 @@ class _Strangers:
                 self._drop(connection, closes=False)
                 yield _ready(connection), caller
         now_s = running_s()
-        for connection in [c for c, one in self._callers.items() if now_s > one.until_s]:
+        for connection in [c for c, client in self._clients.items() if now_s > client.until_s]:
             self._drop(connection)
-        if self._listener in found:
+        if self._listener in readable:
             self._accept()
 
     def close(self) -> None:
-        """Hangs up on all of them; the listener stays open."""
-        for connection in list(self._callers):
+        """Disconnects all of them; the listener stays open."""
+        for connection in list(self._clients):
             self._drop(connection)
         self._selector.close()
 
     def _accept(self) -> None:
-        # Not all at once: those who are answering are heard in between.
+        # Not all at once: those that are answering are read in between.
         for _ in range(_ACCEPTED_AT_ONCE):
             try:
                 connection, _ = self._listener.accept()
@@ -154,37 +158,37 @@ class _Strangers:
                 time.sleep(_PAUSE_S)
                 return
             connection.setblocking(False)
-            self._callers[connection] = _Stranger(connection, self._key)
+            self._clients[connection] = _UnauthenticatedClient(connection, self._key)
             self._selector.register(connection, selectors.EVENT_READ)
-            if len(self._callers) > MAX_STRANGERS:
+            if len(self._clients) > MAX_UNAUTHENTICATED:
                 self._drop_oldest()
 
     def _drop_oldest(self) -> None:
-        if self._callers:
-            self._drop(next(iter(self._callers)))
+        if self._clients:
+            self._drop(next(iter(self._clients)))
 
     def _drop(self, connection: socket.socket, *, closes: bool = True) -> None:
         self._selector.unregister(connection)
-        del self._callers[connection]
+        del self._clients[connection]
         if closes:
             connection.close()
 
 
-class _Stranger:
-    """Somebody who has connected and not proved anything yet."""
+class _UnauthenticatedClient:
+    """A caller that has connected and not proved anything yet."""
 
     def __init__(self, connection: socket.socket, key: Key) -> None:
-        self.until_s = running_s() + STRANGER_S
+        self.until_s = running_s() + PROOF_TIMEOUT_S
         self._connection, self._key = connection, key
         self._nonce = os.urandom(_NONCE_BYTES)
         self._received = b""
-        self._is_greeted = False
+        self._has_nonce = False
 
-    def hear(self) -> Caller | None:
-        """Who it is, once that is proved; None before. Raises OSError if it never will be."""
-        if not self._is_greeted:
+    def receive(self) -> Caller | None:
+        """The caller, once it is proved; None before. Raises OSError if it never will be."""
+        if not self._has_nonce:
             self._connection.sendall(self._nonce)
-            self._is_greeted = True
+            self._has_nonce = True
         try:
             part = self._connection.recv(_CALL_BYTES - len(self._received))
         except BlockingIOError:
@@ -197,20 +201,20 @@ class _Stranger:
         nonce, rest = self._received[:_NONCE_BYTES], self._received[_NONCE_BYTES:]
         caller, proof = rest[: _CALLER.size], rest[_CALLER.size :]
         nonces = nonce + self._nonce
-        if not hmac.compare_digest(proof, self._key.proof(b"calls", caller, nonces)):
+        if not hmac.compare_digest(proof, self._key.proof(_CALLS, caller, nonces)):
             raise ConnectionError("it is not of this job")
-        self._connection.sendall(self._key.proof(b"hears", caller, nonces))
+        self._connection.sendall(self._key.proof(_HEARS, caller, nonces))
         return _CALLER.unpack(caller)
 
 
 def _connected(address: tuple[str, int], time_left: TimeLeft) -> socket.socket:
-    """A connection with whoever listens there."""
+    """A connection with the process that listens there."""
     while True:
         left_s = max(time_left(), _PAUSE_S)
         try:
             return socket.create_connection(address, min(left_s, _CONNECT_S))
         except TimeoutError:
-            # Strangers may have filled what waits to be accepted.
+            # Other clients may have filled the backlog of the listener.
             if time_left() <= 0:
                 raise Unreachable("timed out") from None
         except OSError as error:
@@ -222,8 +226,8 @@ def _prove(connection: socket.socket, key: Key, caller: bytes, time_left: TimeLe
     nonce = os.urandom(_NONCE_BYTES)
     connection.sendall(nonce)
     nonces = nonce + _read(connection, _NONCE_BYTES, time_left)
-    connection.sendall(caller + key.proof(b"calls", caller, nonces))
-    expected = key.proof(b"hears", caller, nonces)
+    connection.sendall(caller + key.proof(_CALLS, caller, nonces))
+    expected = key.proof(_HEARS, caller, nonces)
     if not hmac.compare_digest(_read(connection, len(expected), time_left), expected):
         raise ConnectionError("it is not of this job")
 

@@ -1,6 +1,6 @@
 """How the leader of a node sees whether other nodes live while devices wait for each other.
 
-A device that waits in a ring for a GPU of another node says nothing. So leaders have a connection
+A device that waits in a ring for a GPU of another node sends nothing. So leaders have a connection
 of their own with each other, and send a byte five times a second while they wait for anything.
 """
 
@@ -31,7 +31,7 @@ class LeaderWatch:
 
     def __init__(self, sockets: Sockets, node: int, ids: Sequence[int]) -> None:
         self._sockets, self._node, self._ids = sockets, node, ids
-        self._heard_s = dict.fromkeys(sockets, running_s())
+        self._received_s = dict.fromkeys(sockets, running_s())
         self._arrivals = dict.fromkeys(sockets, 0)
         self._num_barriers = 0
         self._gone: set[int] = set()
@@ -45,8 +45,8 @@ class LeaderWatch:
         """`beat`, and an error if another node is gone, or silent since `since_s` for too long.
 
         Raises:
-          PeerLost: a leader has hung up before it came to the next barrier.
-          CollectiveTimeout: nothing was heard of a node for `timeout_s`.
+          PeerLost: a leader has disconnected before it reached the next barrier.
+          CollectiveTimeout: nothing was received from a node for `timeout_s`.
         """
         self.beat()
         late = [node for node in self._sockets if self._arrivals[node] <= self._num_barriers]
@@ -54,7 +54,7 @@ class LeaderWatch:
         if gone := [node for node in late if node in self._gone]:
             raise PeerLost(own, self._ids[gone[0]], f"{operation} of several nodes", step)
         limit_s = running_s() - timeout_s
-        if silent := [n for n in late if max(self._heard_s[n], since_s) <= limit_s]:
+        if silent := [n for n in late if max(self._received_s[n], since_s) <= limit_s]:
             missing = tuple(self._ids[node] for node in silent)
             raise CollectiveTimeout(own, missing, f"{operation} of several nodes", step, timeout_s)
 
@@ -93,7 +93,7 @@ class LeaderWatch:
 
     def _send(self, data: bytes) -> None:
         for connection in self._sockets.values():
-            # It is gone, which is for `look` to say, or has not read what was sent for hours.
+            # It is gone, which `look` reports, or has not read what was sent for hours.
             with suppress(OSError):
                 connection.send(data)
 
@@ -106,7 +106,7 @@ class LeaderWatch:
             except OSError:
                 data = b""
             if data:
-                self._heard_s[node] = running_s()
+                self._received_s[node] = running_s()
                 self._arrivals[node] += data.count(_HAS_ARRIVED)
             else:
                 self._gone.add(node)

@@ -56,7 +56,7 @@ class Mesh:
         self._first_call = 1
 
     def restart(self) -> None:
-        """Says that the calls so far belong to the start: the next one is the first."""
+        """Marks the calls so far as part of the start: the next one is the first."""
         self._first_call = self._calls + 1
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:

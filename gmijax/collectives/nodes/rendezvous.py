@@ -2,7 +2,7 @@
 
 Before a GMI is started every node opens a listening socket, which its leader inherits; then all
 leaders get all addresses, and a secret. Node i connects to the nodes before it, and both ends
-prove that they know the secret (`handshake.py`). When all are there nobody listens any more.
+prove that they know the secret (`handshake.py`). Once all are connected, the sockets are closed.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class NodeAddresses(NamedTuple):
     @classmethod
     def from_file(cls, fd: int) -> NodeAddresses:
         """Inverts `to_file`."""
-        node, found, token, calls = json.loads(os.pread(fd, os.fstat(fd).st_size, 0))
-        addresses = tuple((host, port) for host, port in found)
+        node, hosts_and_ports, token, calls = json.loads(os.pread(fd, os.fstat(fd).st_size, 0))
+        addresses = tuple((host, port) for host, port in hosts_and_ports)
         pairs = {(listener, caller): address for listener, caller, address in calls}
         return cls(node, addresses, bytes.fromhex(token), pairs)
 
@@ -86,8 +86,8 @@ def listen(address: str) -> socket.socket:
 
 @contextmanager
 def reserved_address(host: str) -> Iterator[str]:
-    """`host:port`, which cannot go to somebody else before the GMI that gets it listens there."""
-    # Bound without listening, and shared with this user: connections go to who listens.
+    """`host:port`, which no other user can take before the GMI that gets it listens there."""
+    # Bound without listening, and shared with this user: connections go to the GMI that listens.
     with socket.socket() as holder:
         holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         holder.bind((host, 0))
@@ -105,14 +105,14 @@ def connect(
     deadline_s = running_s() + timeout_s
     lanes: list[dict[int, socket.socket]] = [{} for _ in range(num_lanes)]
     try:
-        for lane, found in enumerate(lanes):
+        for lane, connections in enumerate(lanes):
             for node in range(nodes.node):
-                found[node] = _call(nodes, node, lane, deadline_s)
+                connections[node] = _call(nodes, node, lane, deadline_s)
         if nodes.node + 1 < len(nodes.addresses):
             _accept(nodes, listener, lanes, deadline_s)
     except BaseException:
-        for found in lanes:
-            for connection in found.values():
+        for connections in lanes:
+            for connection in connections.values():
                 connection.close()
         raise
     return list(lanes)
@@ -126,7 +126,7 @@ def _call(nodes: NodeAddresses, node: int, lane: int, deadline_s: float) -> sock
         return call(address, key, (nodes.node, lane), lambda: deadline_s - running_s())
     except Unreachable as error:
         raise CollectiveError(
-            f"node {nodes.node} cannot reach {where} ({error}); cluster.interface says which "
+            f"node {nodes.node} cannot reach {where} ({error}); cluster.interface sets the "
             "network to use"
         ) from None
     except OSError as error:

@@ -68,7 +68,7 @@ def adapt(
     Observations that are dicts: the entry `state` where there is one, which the policy sees, and
     behind it `privileged_state`, which the value function sees too; else all entries in the order
     of their names. Scalars of `metrics` are summed over the episode, as Brax's `EpisodeWrapper`
-    does. `done` terminates, unless `info["truncation"]` says that time ran out.
+    does. `done` terminates, unless `info["truncation"]` is set: time ran out.
 
     Args:
       theirs: one of their environments, without wrappers.
@@ -76,7 +76,7 @@ def adapt(
       episode_length: steps after which an episode is truncated.
       mj_model: the MuJoCo model to film it with, None for no films.
       qpos: their state -> [nq], joint positions of that model; None for no films.
-      with_model: `(theirs, model)`: within it theirs has what `model`, one of ours, says.
+      with_model: `(theirs, model)`: within it theirs has the values of `model`, one of ours.
 
     Raises:
       ConfigError: observations that are no vectors, or a state that changes its shape.
@@ -187,7 +187,7 @@ def _obs_size(obs: Any, name: str) -> int:
 def _alike(before: PyTree, after: PyTree) -> PyTree:
     """`after` with the dtypes of `before`: some of theirs return plain Python numbers."""
     if jax.tree.structure(before) != jax.tree.structure(after):
-        return after  # `check_env` says what is different.
+        return after  # `check_env` reports the difference.
     return jax.tree.map(_with_dtype, before, after)
 
 

@@ -28,7 +28,7 @@ def check_env(env: Any, what: str) -> Env:
     """The environment, with sizes that are Python's integers, as files and programs want them.
 
     Raises:
-      ConfigError: `env` is none; one line, in which `what` says which.
+      ConfigError: `env` is none; one line, which names it by `what`.
     """
     if not isinstance(env, Env):
         raise ConfigError(f"{what}: expected a gmijax.sim.interface.Env, got {_kind(env)}")
@@ -103,10 +103,10 @@ def check_start(env: Env, what: str) -> None:
 
 
 def attempt(what: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Calls somebody else's code.
+    """Calls the user's code.
 
     Raises:
-      ConfigError: it raised anything; the line has the innermost place, the cause the rest.
+      ConfigError: it raised anything; the line has the innermost location, the cause the rest.
     """
     try:
         return function(*arguments, **named)

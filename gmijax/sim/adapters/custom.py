@@ -55,8 +55,8 @@ def make(
     handed on where they are not empty, `curriculum` where it is true.
 
     Raises:
-      ConfigError: the file or the function cannot be had, it takes no such argument, it fails, or
-        what it returns is no environment; one line, with the place.
+      ConfigError: the file or the function cannot be loaded, it takes no such argument, it fails,
+        or what it returns is no environment; one line, with the location.
     """
     path, function = split(name)
     changes = {"rewards": rewards, "settings": settings, "curriculum": curriculum}
@@ -126,7 +126,7 @@ def load_module(path: Path, source_sha256: str | None) -> ModuleType:
     text = path.read_bytes()
     if source_sha256 not in (None, hashlib.sha256(text).hexdigest()):
         raise ConfigError(f"env={nearby(path)}: has changed since the job was started")
-    # A name of its own: a file called brax.py must not take the place of a package.
+    # A name of its own: a file called brax.py must not shadow a package.
     name = f"gmijax_custom_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:

@@ -39,7 +39,7 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
     """N environments that are stepped by one compiled program.
 
     Rewards are float32 [N], terminations and truncations bool [N], actions are clipped to
-    [-1, 1]. `info["is_diverged"]` [N] says which environments were ended because of a bad number,
+    [-1, 1]. `info["is_diverged"]` [N] marks environments that were ended because of a bad number,
     an action that is NaN among them; they count as terminated. The same seed gives the same
     episodes on the same machine.
 
@@ -100,7 +100,7 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
           seed: for all environments, or a list with one for each, None for any.
-          options: `{"reset_mask": mask}`, bool [N]: only there; the other environments go on.
+          options: `{"reset_mask": mask}`, bool [N]: only there; the other environments continue.
 
         Returns:
           Observations [N, O] of all environments, and an empty dict.
@@ -145,7 +145,7 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
         return found(*args, **kwargs) if callable(found) else (found,) * self.num_envs
 
     def _final(self, out: VectorOutcome) -> dict[str, Any]:
-        """What Gymnasium says of episodes that ended; as arrays, not as objects."""
+        """Gymnasium's `info` of episodes that ended; as arrays, not as objects."""
         ended = out.terminated | out.truncated
         if self._arrays == "numpy" and not ended.any():
             return {}

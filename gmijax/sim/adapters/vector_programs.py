@@ -63,7 +63,7 @@ class VectorPrograms:
     def start(self, keys: PRNGKey) -> BatchState:
         """New episodes in all environments, from keys [N]."""
         state = self._init(self._model, keys)
-        # Without a head start for anybody; who wants one sets it.
+        # Without a head start; the user may set one.
         state = state._replace(head_start=jnp.zeros_like(state.head_start))
         # Committed to the device, as what a step returns: else the second step would compile anew.
         return jax.device_put(state, self.device)

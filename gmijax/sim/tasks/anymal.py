@@ -208,7 +208,7 @@ def look_up(mj_model: mujoco.MjModel) -> AnymalIds:
 def draw_start(
     ids: AnymalIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: AnymalSettings
 ) -> tuple[Array, Array]:
-    """Random `qpos` [19] and `qvel` [18]: the base in its place, the legs near standing."""
+    """Random `qpos` [19] and `qvel` [18]: the base where it starts, the legs near standing."""
     position_key, velocity_key = draws.split(key)
     shape, noise = (ACTION_SIZE,), settings.joint_velocity_noise_rad_per_s
     least, most = settings.start_factor_min, settings.start_factor_max

@@ -141,8 +141,8 @@ def look_up(mj_model: mujoco.MjModel) -> BallBalanceIds:
     return BallBalanceIds(
         lookup.find_joints(mj_model, KNEES),
         *lookup.free_joint_addresses(mj_model, "ball"),
-        # Of each force only z, along which the leg carries: the load on three legs says where
-        # the ball is and how hard it lands. The task's size leaves room for three forces.
+        # Of each force only z, along which the leg carries: the load on three legs shows where
+        # the ball is and how hard it lands. The task's size is that of three forces.
         np.concatenate([forces[2::3], torques]),
     )
 

@@ -85,7 +85,7 @@ class FrankaCabinetPose(NamedTuple):
     """Where gripper and handle are, in the world.
 
     Attributes:
-      grasp: [3] the gripper's point that is to meet the handle, metres.
+      grasp: [3] the gripper's point that is to reach the handle, metres.
       handle: [3] the handle's point, metres.
       forward: [3] unit vector along which the fingers point.
       up: [3] unit vector from the right finger to the left one.
@@ -118,7 +118,7 @@ class FrankaCabinetView(NamedTuple):
 
 
 def closeness(view: FrankaCabinetView) -> Array:
-    """1 where the gripper meets the handle, less with distance; doubled when near."""
+    """1 where the gripper is at the handle, less with distance; doubled when near."""
     way = view.pose.handle - view.pose.grasp
     squared = way @ way
     shape = (1.0 + squared / view.distance_scale_m**2) ** -2

@@ -90,7 +90,7 @@ def look_up(mj_model: mujoco.MjModel, joints: Sequence[str], sensors: Sequence[s
 def draw_start(
     ids: RunnerIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: RunnerSettings
 ) -> tuple[Array, Array]:
-    """Random `qpos` [nq] and `qvel` [nv]: the torso in its place, noise on the joints only."""
+    """Random `qpos` [nq] and `qvel` [nv]: the torso where it starts, noise on the joints only."""
     position_key, velocity_key = draws.split(key)
     lower, upper = ids.joints.lower, ids.joints.upper
     shape, noise = lower.shape, settings.joint_noise_rad

@@ -30,7 +30,7 @@ class TaskSettings(KeyGroup):
 
 
 def settings_from(cls: type[S], given: Mapping[str, Any] | None) -> S:
-    """The settings of a task with those that are `given` in place of the defaults.
+    """The settings of a task: those that are `given`, and defaults for the others.
 
     Raises:
       ConfigError: an unknown name, no number, or one out of bounds.

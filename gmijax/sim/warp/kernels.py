@@ -14,8 +14,7 @@ import mujoco
 from mujoco.mjx import warp as mjx_warp
 
 _ANY_SIZE = (64, 64)
-"""Threads of a block and number of blocks, in place of Warp's answer, which needs a compiled
-kernel."""
+"""Threads of a block and number of blocks, instead of Warp's own, which need a compiled kernel."""
 
 _ONE_AT_A_TIME = threading.Lock()
 """Held while functions of Warp are replaced."""
@@ -48,7 +47,7 @@ def compile_kernels(mj_model: mujoco.MjModel) -> None:
         variants = launched_by(lambda: mujoco_warp.step(model, data))
 
     def load(variant: Variant) -> None:
-        with suppress(Exception):  # A kernel that is launched says so again.
+        with suppress(Exception):  # A launch of the kernel raises it again.
             warp.force_load(device, [variant.module], block_dim=variant.block_dim, max_workers=0)
 
     num_threads = max(1, min(len(variants), len(os.sched_getaffinity(0))))
@@ -91,7 +90,7 @@ def _noting(found: dict[Variant, None]) -> Iterator[None]:
         return _ANY_SIZE
 
     def nothing(*_: Any, **__: Any) -> None:
-        """Sorts and scans would read arrays that nobody has computed."""
+        """Sorts and scans would read arrays that were not computed."""
 
     with (
         _replaced(warp.Module, load=load),
@@ -110,7 +109,7 @@ def _noting(found: dict[Variant, None]) -> Iterator[None]:
 
 @contextmanager
 def _replaced(owner: Any, **others: Callable[..., Any]) -> Iterator[None]:
-    """Other functions in place of those of `owner`, in this thread."""
+    """Replaces functions of `owner`, in this thread."""
     own = {name: getattr(owner, name) for name in others}
     thread = threading.get_ident()
 

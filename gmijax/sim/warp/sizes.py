@@ -1,7 +1,7 @@
 """How large MuJoCo Warp's buffers must be for a model: from the geoms that can touch.
 
 Where meshes or many geoms collide, all pairs together could make thousands of contacts, of which a
-few dozen ever touch at once: then there is room for `MANY` of an environment.
+few dozen ever touch at once: then the buffers hold `MANY` of an environment.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _EQUALITY_ROWS = {
     int(mujoco.mjtEq.mjEQ_JOINT): 1,
     int(mujoco.mjtEq.mjEQ_TENDON): 1,
 }
-"""Rows of an equality constraint; those of a flex have as many as MuJoCo says."""
+"""Rows of an equality constraint; those of a flex have as many as in MuJoCo."""
 
 
 class Bounds(NamedTuple):
-    """What no state of an environment can exceed, and what has room.
+    """What no state of an environment can exceed, and what the buffers hold.
 
     Attributes:
       contacts: of all pairs of geoms that may collide.

@@ -46,7 +46,7 @@ class WarpStep:
       substeps: physics steps of a control step.
       sizes: of the buffers for contacts and constraints.
       shapes: of the arrays that MuJoCo Warp's data have for each environment, by name.
-      bounds: what no state of an environment can exceed; None if nobody asked.
+      bounds: what no state of an environment can exceed; None if not requested.
     """
 
     mj_model: mujoco.MjModel

@@ -59,9 +59,9 @@ class Backend:
         """
 
     def started(self, pid: int, group: int | None = None) -> None:
-        """Tells the backend that a GMI runs as the process group `pid`.
+        """Records that a GMI runs as the process group `pid`.
 
-        Of a `group` whose leader has ended it is given the other members.
+        Of a `group` whose leader has ended it gets the other members.
         """
         if self._janitor is not None:
             self._janitor.watch_gmi(pid, group)

@@ -1,8 +1,8 @@
 """Backends of GPUs: GMIs run at the same time under NVIDIA's Multi-Process Service, or do not.
 
 One daemon per GPU (or shared MIG instance), with a pipe directory of its own: a fatal fault of one
-client ends every client of its server, so GPUs must not share a server. A daemon that somebody
-else has started is used and never stopped.
+client ends every client of its server, so GPUs must not share a server. A daemon that gmijax has
+not started is used and never stopped.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class MpsBackend(Backend):
 
     Args:
       plan: its allocations name the devices.
-      machine: where the control program is, and whether somebody's daemon runs.
+      machine: where the control program is, and whether a daemon runs already.
       run: logs go below its `mps` folder.
       gmis: those that are clients of a daemon; None for all.
 
@@ -58,8 +58,8 @@ class MpsBackend(Backend):
                 f"plan.backend={plan.backend}: nvidia-cuda-mps-control was not found"
             )
         self._program = machine.mps_control or Path()
-        # Daemons of somebody else, and those that this job starts.
-        self._theirs = {
+        # Daemons that this job did not start, and those that it does.
+        self._existing = {
             device: MpsControl(self._program, pipe)
             for device in self._devices.values()
             if (pipe := machine.daemon_of(device)) is not None
@@ -72,7 +72,7 @@ class MpsBackend(Backend):
         super().__enter__()
         try:
             for device in dict.fromkeys(self._devices.values()):
-                if device not in self._theirs:
+                if device not in self._existing:
                     self._start_daemon(device)
         except BaseException:
             self._quit_all()
@@ -93,14 +93,14 @@ class MpsBackend(Backend):
     @property
     def daemons(self) -> Mapping[str, Path]:
         """See `Backend`."""
-        used = self._theirs | self._own
+        used = self._existing | self._own
         return {device: control.pipe_directory for device, control in used.items()}
 
     def environment(self, gmi: int) -> Mapping[str, str]:
         """Where the GMI's daemon listens, or a directory where none does.
 
         CUDA takes the latter for "no MPS", silently. It is below the run folder because there
-        nobody else can start a daemon in it.
+        no other user can start a daemon in it.
         """
         if gmi in self._devices:
             return {PIPE_VARIABLE: str(self._control_of(gmi).pipe_directory)}
@@ -114,18 +114,18 @@ class MpsBackend(Backend):
         if device in self._own and not self._own[device].is_answering():
             quit_daemon(self._own[device])
             self._start_daemon(device)
-        # Somebody else may have renewed theirs: what starts now is worth asking it once more.
+        # An existing one may have been restarted too: it is asked once more for each new GMI.
         self._unresponsive -= {device}
 
     def verify(self, pids: Mapping[int, int]) -> None:
         """Checks with the daemons that every GMI that is to be a client is one.
 
-        CUDA falls back to taking turns, silently, when it does not reach the daemon.
+        CUDA falls back to time slicing, silently, when it does not reach the daemon.
         """
         deadline_s = running_s() + _CLIENTS_APPEAR_S
-        while strangers := self._strangers(pids):
+        while non_clients := self._non_clients(pids):
             if running_s() > deadline_s:
-                gmi, pid = next(iter(strangers.items()))
+                gmi, pid = next(iter(non_clients.items()))
                 raise GmiFailed(
                     gmi,
                     f"its process {pid} is not a client of the MPS daemon in "
@@ -161,14 +161,14 @@ class MpsBackend(Backend):
 
     def _control_of(self, gmi: int) -> MpsControl:
         device = self._devices[gmi]
-        return self._own.get(device) or self._theirs[device]
+        return self._own.get(device) or self._existing[device]
 
     def _start_daemon(self, device: str) -> None:
-        place = list(dict.fromkeys(self._devices.values())).index(device)
-        log_directory = self.run.mps / f"gpu_{place}"
+        index = list(dict.fromkeys(self._devices.values())).index(device)
+        log_directory = self.run.mps / f"gpu_{index}"
         parent = tempfile.gettempdir()
         parent = parent if len(parent) <= _LONGEST_PARENT else "/tmp"
-        # mkdtemp makes it readable for nobody else.
+        # mkdtemp makes it readable for this user only.
         control = MpsControl(self._program, Path(tempfile.mkdtemp(prefix="gmijax-", dir=parent)))
         self._own[device] = control
         if self._janitor is not None:
@@ -183,25 +183,25 @@ class MpsBackend(Backend):
                 )
             time.sleep(_POLL_S)
 
-    def _strangers(self, pids: Mapping[int, int]) -> dict[int, int]:
+    def _non_clients(self, pids: Mapping[int, int]) -> dict[int, int]:
         """Those of the GMIs that are to be clients and are not."""
-        found: dict[MpsControl, Mapping[int, int]] = {}
-        strangers: dict[int, int] = {}
+        clients: dict[MpsControl, Mapping[int, int]] = {}
+        non_clients: dict[int, int] = {}
         for gmi, pid in pids.items():
             if gmi not in self._devices:
                 continue
             control = self._control_of(gmi)
             try:
-                if control not in found:
-                    found[control] = control.all_client_pids()
+                if control not in clients:
+                    clients[control] = control.all_client_pids()
             except BackendUnavailable as error:
                 raise GmiFailed(gmi, f"cannot ask whether it is an MPS client: {error}") from error
-            if pid not in found[control]:
-                strangers[gmi] = pid
-        return strangers
+            if pid not in clients[control]:
+                non_clients[gmi] = pid
+        return non_clients
 
     def _advice(self, gmi: int) -> str:
-        if self._devices[gmi] not in self._theirs:
+        if self._devices[gmi] not in self._existing:
             return f"see its logs in {self.run.mps}, or use plan.backend=share"
         return (
             "gmijax did not start this daemon: if it runs in another PID namespace (outside of "
@@ -249,7 +249,7 @@ class MigBackend(MpsBackend):
             for allocation in here
             if sharing[allocation.device] > 1 or allocation.device in machine.daemons
         ]
-        # A daemon of somebody else is for other devices than the job's instances.
+        # An existing daemon is for other devices than the job's instances.
         own_only = dataclasses.replace(machine, operator_daemon=None)
         super().__init__(plan, own_only, run, clients)
 
