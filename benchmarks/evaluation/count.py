@@ -1,10 +1,10 @@
 """Counts the figures of documents, and those of them that a reviewer believes.
 
 A figure is a marked one, or a cell with a digit in a column of numbers that are measured. It is
-believed if its file has commit and date, and it is of three runs or more. A cell says of how many
-it is (`n=3`, `5 of 20`); one that does not is of as many as every case of its files, at least one;
-a ratio, of as many as the cells of its row. Files are those below a table, or the one that a row
-names. Not counted: tables of words, which repeat figures of others.
+believed if its file has commit and date, and at least three runs are behind it. A cell may state
+their number (`n=3`, `5 of 20`); without one it has as many as every case of its files, at least
+one; a ratio has as many as the cells of its row. Files are those below a table, or the one that a
+row names. Not counted: tables of words, which repeat figures of others.
 """
 
 from __future__ import annotations
