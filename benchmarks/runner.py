@@ -22,7 +22,7 @@ from gmijax.runs.folder import read_json
 from gmijax.supervise.failures import last_line
 
 STOP_S = 15.0
-"""For a command that meets its deadline to save and end."""
+"""Time for a command that has reached its deadline to save and end."""
 
 _ROOT = Path(__file__).resolve().parents[1]
 

@@ -65,7 +65,9 @@ class Benchmark:
         self.file = results_file(given, "peers")
         self._runs: dict[Side, list[dict[str, Any]]] = {side: [] for side in sides}
         self.file.results["cases"] = {
-            str(side): {"told": side.told, "runs": runs} for side, runs in self._runs.items()
+            # The key of the settings as in the calls that are already in the file.
+            str(side): {"told": side.settings, "runs": runs}
+            for side, runs in self._runs.items()
         }
 
     @property
@@ -175,7 +177,7 @@ def wanted_sides(
             sys.stderr.write(f"{name}: left out, give {_PLACES[peer]}\n")
             continue
         for side in (Side(name, trainer, more, places.get(peer, "")) for trainer in (OURS, peer)):
-            _ = side.told  # Composes it, so that a wrong override is found now.
+            _ = side.settings  # Composes them, so that a wrong override is found now.
             yield side
 
 
