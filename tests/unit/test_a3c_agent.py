@@ -136,9 +136,9 @@ def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path) -> None:
             wait_until(lambda: added(5), 60, "environments in the checkpoint")
         finally:
             registers.orders.publish(AgentCommand(9, is_ending=True).pack())
-        told = outcome.result(timeout=120)
-    assert told["unrolls"] == 0
-    assert 0 < told["wait_s"] <= sender.waited_s
+        summary = outcome.result(timeout=120)
+    assert summary["unrolls"] == 0
+    assert 0 < summary["wait_s"] <= sender.waited_s
     assert added(9)
     saved = [path.name for path in link.run.checkpoints.glob(".*.partial/gmi_1")]
     assert len(saved) == 2

@@ -320,14 +320,14 @@ def test_an_overflow_of_playground_in_warp_is_told_in_its_own_step_alone():
     env = from_playground(WarpBalls(), name="balls")
     batch = training_env(env)
     state = batch.init(batch.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
-    step, told, lifted = jax.jit(batch.step), [], []
+    step, reported, lifted = jax.jit(batch.step), [], []
     for _ in range(60):
         before = state.env.obs[:, 2]
         state, out = step(batch.model, state, jnp.zeros((NUM_ENVS, 1)))
-        told.append(int(out.overflowed["contact"]) > 0)
+        reported.append(int(out.overflowed["contact"]) > 0)
         lifted.append(bool((state.env.obs[:, 2] > before).any()))
     assert sum(lifted) == 1
-    np.testing.assert_array_equal(told, lifted)
+    np.testing.assert_array_equal(reported, lifted)
 
 
 def test_an_environment_of_brax_brings_its_model_and_length():

@@ -94,7 +94,7 @@ def test_ranks_that_ask_for_different_things_are_told_both(
     while first == 0 and not exchanges[0].barrier.step:
         pass
     others = [pool.submit(reduce, rank) for rank in range(RANKS) if rank != first]
-    told = [one.result() for one in (early, *others)]
-    for said in told:
-        assert "the mean of 8192 numbers of float32" in said
-        assert "the sum of 8192 numbers of float32" in said
+    messages = [one.result() for one in (early, *others)]
+    for message in messages:
+        assert "the mean of 8192 numbers of float32" in message
+        assert "the sum of 8192 numbers of float32" in message

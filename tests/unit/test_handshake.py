@@ -131,29 +131,29 @@ def _proof_of_another_call(listener: socket.socket) -> bytes:
         connection, _ = other.accept()
         with connection:
             connection.settimeout(5.0)
-            heard = connection.recv(32, socket.MSG_WAITALL)
+            received = connection.recv(32, socket.MSG_WAITALL)
             connection.sendall(bytes(32))
-            heard += connection.recv(40, socket.MSG_WAITALL)
+            received += connection.recv(40, socket.MSG_WAITALL)
         thread.join()
-    return heard
+    return received
 
 
 def test_what_was_sent_once_proves_nothing_later(listener: socket.socket) -> None:
-    heard = _proof_of_another_call(listener)
-    assert len(heard) == 72
-    with stranger(listener, heard) as other:
+    received = _proof_of_another_call(listener)
+    assert len(received) == 72
+    with stranger(listener, received) as other:
         assert first(listener, 0.5) is None
         assert is_hung_up_on(other)
 
 
 def test_what_the_listener_sends_proves_nothing_to_itself(listener: socket.socket) -> None:
     with ThreadPoolExecutor(1) as pool, stranger(listener, bytes(32)) as other:
-        heard = pool.submit(first, listener, 0.5)
+        answer = pool.submit(first, listener, 0.5)
         nonce = other.recv(32, socket.MSG_WAITALL)
         caller = struct.pack("<II", *CALLER)
         # The proof that the listener itself would send.
         other.sendall(caller + KEY.proof(b"hears", caller, bytes(32) + nonce))
-        assert heard.result() is None
+        assert answer.result() is None
         assert is_hung_up_on(other)
 
 

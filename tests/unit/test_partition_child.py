@@ -85,8 +85,8 @@ def test_beats_and_errors_reach_whoever_has_the_memory(
     assert failure.reason == "exit code 1: ValueError: first"
     assert (failure.iteration, failure.error) == (7, seen.read_error())
     link.report_error(KeyboardInterrupt())
-    told = describe_exit(3, 1, seen.read_error(), link.paths.stderr)
-    assert told.reason == "exit code 1: KeyboardInterrupt"
+    described = describe_exit(3, 1, seen.read_error(), link.paths.stderr)
+    assert described.reason == "exit code 1: KeyboardInterrupt"
 
 
 def test_an_error_is_told_where_nothing_can_be_written(
@@ -178,7 +178,9 @@ def test_only_the_end_of_a_long_log_is_read(tmp_path: Path):
 
 
 def test_a_lack_of_memory_is_named_where_xla_hides_it(tmp_path: Path):
-    said = "NOT_FOUND: All configs failed during profiling or were excluded from selection."
-    error = ReportedError("JaxRuntimeError", said, said, ())
+    message = "NOT_FOUND: All configs failed during profiling or were excluded from selection."
+    error = ReportedError("JaxRuntimeError", message, message, ())
     reason = describe_exit(0, 1, error, GmiPaths(tmp_path).stderr).reason
-    assert reason.startswith(f"exit code 1: JaxRuntimeError: {said} (perhaps there is too little")
+    assert reason.startswith(
+        f"exit code 1: JaxRuntimeError: {message} (perhaps there is too little"
+    )

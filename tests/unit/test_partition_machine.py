@@ -243,8 +243,8 @@ def test_a_plan_says_what_else_could_compute_here(
     monkeypatch.setattr(pynvml, "nvmlInit", failing(pynvml.NVML_ERROR_LIBRARY_NOT_FOUND))
     assert detect_machine().warnings == ()
     (no_devices / device).touch()
-    said = f"warning: {no_devices / device} looks like {what}, which gmijax does not use"
-    assert planned(detect_machine()).reasons[0] == said
+    warning = f"warning: {no_devices / device} looks like {what}, which gmijax does not use"
+    assert planned(detect_machine()).reasons[0] == warning
 
 
 @pytest.mark.parametrize(
@@ -267,8 +267,8 @@ def test_a_plan_says_with_which_settings_of_jax_gmis_do_not_compute(
     variable: str, value: str, is_named: bool, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv(variable, value)
-    said = f"warning: GMIs start without {variable}={value}, with which tasks do not work"
-    assert (said in planned(detect_machine()).reasons) == is_named
+    warning = f"warning: GMIs start without {variable}={value}, with which tasks do not work"
+    assert (warning in planned(detect_machine()).reasons) == is_named
 
 
 @pytest.mark.parametrize(
@@ -291,8 +291,8 @@ def test_a_strangers_daemon_is_not_used(
     script(tmp_path, "exit 0")
     here = detect_machine()
     assert here.operator_daemon == (pipe if is_used else None)
-    said = f"warning: {pipe} belongs to user {owner}, so the MPS daemon there is not used; "
-    assert [text.startswith(said) for text in here.warnings] == [True] * (not is_used)
+    warning = f"warning: {pipe} belongs to user {owner}, so the MPS daemon there is not used; "
+    assert [text.startswith(warning) for text in here.warnings] == [True] * (not is_used)
     # Who names it has decided; but it must answer.
     monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", str(pipe))
     assert detect_machine().operator_daemon == pipe

@@ -55,7 +55,7 @@ def test_indices_are_those_of_the_machine() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"serving_gmis_per_gpu": 0}, r"plan.serving_gmis_per_gpu=0: at least one GMI must act"),
         ({"training_gmis_per_gpu": 0}, r"plan.training_gmis_per_gpu=0: .* must train"),
@@ -71,8 +71,8 @@ def test_indices_are_those_of_the_machine() -> None:
         ({"layout": ((0,), (1,))}, r"plan.layout=\[\[0\], \[1\]\]: with the decoupled template"),
     ],
 )
-def test_what_cannot_be_is_refused(changes, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_what_cannot_be_is_refused(changes, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         place(PlanConfig(**changes))
 
 

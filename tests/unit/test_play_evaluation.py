@@ -175,11 +175,12 @@ def test_a_robot_that_repeats_actions_has_no_walking_test(
     monkeypatch.setattr(trained_run, "left_out", lambda checkpoint: None)
     monkeypatch.setattr(trained_run, "require_env", lambda env: None)
     monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
-    said = "env.action_repeat=2; the walking test takes 1 only"
-    with pytest.raises(ConfigError, match=f"^walking_envs=8: {said}$"):
+    message = "env.action_repeat=2; the walking test takes 1 only"
+    with pytest.raises(ConfigError, match=f"^walking_envs=8: {message}$"):
         playing.play(config_of(f"run.dir={run.root}", "walking_envs=8"))
     assert (
-        playing.walking_lines(config_of(f"run.dir={run.root}"), None) == f"no walking test: {said}"
+        playing.walking_lines(config_of(f"run.dir={run.root}"), None)
+        == f"no walking test: {message}"
     )
     with pytest.raises(ConfigError, match=r"^env.action_repeat=2: the walking test takes 1 only$"):
         walking_env(env, ROBOTS["go1"], "jax", 4)

@@ -326,9 +326,9 @@ def test_no_learning_rate_is_lost_and_no_number_is_written_twice(config, alone) 
     step = SingleRankCommunicator().program(functools.partial(iterate, ENV, mine))
     # The first update has not moved yet, the others each lower the rate.
     rates = [1e-3 / 1.5**k for k in range(4)]
-    _, _, told = _compiled(step, mine)(*_start(mine))
-    assert float(told.figures["policy/learning_rate"]) == pytest.approx(rates[-1])
-    assert {k: float(v) for k, v in told.rates.items()} == pytest.approx(
+    _, _, report = _compiled(step, mine)(*_start(mine))
+    assert float(report.figures["policy/learning_rate"]) == pytest.approx(rates[-1])
+    assert {k: float(v) for k, v in report.rates.items()} == pytest.approx(
         {"mean": np.mean(rates), "min": rates[-1], "max": rates[0]}
     )
     _check_no_number_is_written_twice(step)

@@ -118,9 +118,9 @@ def test_ranks_are_named_by_the_ids_of_their_gmis() -> None:
         "step 1: GMI 4 calls sum of 8 floats, GMI 6 calls sum of 9 floats",
         "step 1: GMI 6 calls sum of 9 floats, GMI 4 calls sum of 8 floats",
     ]
-    for said in told(host_ranks(10, 20, ids=(4, 6)), 8, 8):
-        assert "GMI 4" in said
-        assert "GMI 6" in said
+    for message in told(host_ranks(10, 20, ids=(4, 6)), 8, 8):
+        assert "GMI 4" in message
+        assert "GMI 6" in message
 
 
 def test_a_rank_that_has_closed_is_lost_to_those_who_still_call() -> None:

@@ -163,8 +163,8 @@ def test_a_model_that_an_implementation_refuses_is_told_in_one_line(impl: str):
     balls = "<body><freejoint/><geom size='0.1' condim='1'/></body>" * 12
     option = "jacobian='dense'" if impl == "warp" else "cone='elliptic'"
     text = f"<mujoco model='balls'><option {option}/><worldbody>{balls}</worldbody></mujoco>"
-    said = rf"^physics\.impl={impl}: .+ cannot simulate the model balls: .+"
-    with pytest.raises(ConfigError, match=said) as error:
+    message = rf"^physics\.impl={impl}: .+ cannot simulate the model balls: .+"
+    with pytest.raises(ConfigError, match=message) as error:
         from_mj_model(mujoco.MjModel.from_xml_string(text), impl=impl, substeps=1, max_envs=1)
     assert "\n" not in str(error.value)
 

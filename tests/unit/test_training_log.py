@@ -72,9 +72,9 @@ def test_the_first_overflow_is_told_and_all_are_logged(
     assert [line.get("physics/contact_overflow_steps") for line in lines] == [0.0, 5.0, 7.0, None]
     assert [line.get("physics/constraint_overflow_steps") for line in lines] == [0, 0, 0, None]
     assert log.overflows.steps == {"contact": 12.0, "constraint": 0.0}
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 1
-    assert told[0].startswith("point_mass: MJX-Warp's contact buffer was too small in 5 ")
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 1
+    assert errors[0].startswith("point_mass: MJX-Warp's contact buffer was too small in 5 ")
 
 
 def test_reports_come_in_order_from_a_thread_of_their_own_and_errors_with_the_next_call() -> None:

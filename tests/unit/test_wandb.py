@@ -70,13 +70,13 @@ def follow(
     summary: Mapping[str, Any] | None = None,
 ) -> list[str]:
     """A run with a line of metrics at each of `steps`; returns what the user is told."""
-    said: list[str] = []
-    with followed(config, run, checkpoint, said.append):
+    messages: list[str] = []
+    with followed(config, run, checkpoint, messages.append):
         for env_steps in steps:
             line(run, env_steps=env_steps, **{"return": None, "loss/policy": env_steps / 2})
         if summary:
             write_json(run.summary, summary)
-    return said
+    return messages
 
 
 def test_lines_configuration_and_summary_are_sent(tmp_path: Path, fake: Path):
@@ -115,8 +115,8 @@ def test_what_fails_is_one_line_and_no_error(
     tmp_path: Path, fake: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("FAKE_FAILS", "1")
-    said = follow(a_run(tmp_path / "run"), compose("wandb.mode=online"), (64,))
-    assert said == ["Weights & Biases: nothing more is sent: RuntimeError: no network"]
+    messages = follow(a_run(tmp_path / "run"), compose("wandb.mode=online"), (64,))
+    assert messages == ["Weights & Biases: nothing more is sent: RuntimeError: no network"]
     assert not fake.exists()
 
 
