@@ -100,7 +100,7 @@ def test_newer_weights_are_taken_up_within_an_unroll(tmp_path) -> None:
     assert [version for _, version in sender.taken] == [3, 3, 4]
 
     @jax.jit
-    def told(experience, theirs):
+    def log_prob_of(experience, theirs):
         obs = normalize(theirs.moments, experience.state)
         networks, params = learner.networks, theirs.params
         output = networks.output(params, obs)
@@ -113,7 +113,7 @@ def test_newer_weights_are_taken_up_within_an_unroll(tmp_path) -> None:
         (second, slice(2, 4), bolder),
         (third, slice(None), bolder),
     ):
-        want = told(experience, theirs)[steps]
+        want = log_prob_of(experience, theirs)[steps]
         np.testing.assert_allclose(experience.log_prob[steps], want, rtol=1e-4, atol=1e-4)
 
 

@@ -57,12 +57,12 @@ def _start(config, num_envs: int = N):
 
 
 def _alone(learner):
-    """The update of a job with one trainer, compiled: `(state, batch, weight) -> state, told`."""
+    """The compiled update of a job with one trainer: `(state, batch, weight)` -> state, report."""
     program = jax.jit(partial(update, learner, LocalCollectives(), ()))
 
     def call(state, batch, weight):
-        state, _, measured = program(state, (batch, weight))
-        return state, measured
+        state, _, report = program(state, (batch, weight))
+        return state, report
 
     return call
 
@@ -110,7 +110,7 @@ def test_an_unroll_is_what_the_environments_did(config) -> None:
         np.testing.assert_array_equal(got.state[0], before)
         np.testing.assert_array_equal(got.bootstrap[0], envs.env.obs)
         assert float(stats.episodes.count) == got.done.any(-1).sum()
-        # A value behind a step is told where time ran out, and nowhere else.
+        # There is a value behind a step where time ran out, and nowhere else.
         np.testing.assert_array_equal(got.cut_value != 0, got.done[..., 1])
         cuts += int(got.done[..., 1].sum())
         before = envs.env.obs
@@ -215,7 +215,7 @@ def test_two_trainers_stay_equal_and_weigh_fresh_unrolls_alike(config) -> None:
     assert float(a.obs_moments.count) == len(seen)
     losses = A3cLosses(*(x[0] for x in both_measured.losses))
     np.testing.assert_allclose(measured.losses, losses, rtol=1e-4, atol=1e-6)
-    # Adam divides by the gradient's size: its moments tell how large it was.
+    # Adam divides by the gradient's size: its moments show how large it was.
     chex.assert_trees_all_close(alone.opt_state, a.opt_state, rtol=1e-3, atol=1e-6)
     only_fresh = jax.tree.map(lambda x: x[:, fresh > 0], both)
     _, theirs = jax.device_get(learn(state, only_fresh, np.ones(N + 1, np.float32)))
@@ -241,7 +241,7 @@ def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(start, batc
     assert float(losses[2].steering_kl) == 0.0
 
 
-def test_learning_rates_of_all_minibatches_are_told(config) -> None:
+def test_learning_rates_of_all_minibatches_are_reported(config) -> None:
     adaptive = dataclasses.replace(
         config, learning_rate_schedule="adaptive_kl", learning_rate=1e-3, desired_kl=1e-7
     )

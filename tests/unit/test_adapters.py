@@ -315,7 +315,7 @@ def test_states_of_playground_in_warp_start_over_one_by_one(times: int):
     assert batch.overflows == OVERFLOWS
 
 
-def test_an_overflow_of_playground_in_warp_is_told_in_its_own_step_alone():
+def test_an_overflow_of_playground_in_warp_is_reported_in_its_own_step_alone():
     pytest.importorskip("warp")
     env = from_playground(WarpBalls(), name="balls")
     batch = training_env(env)
@@ -365,7 +365,7 @@ def test_an_environment_of_brax_brings_its_model_and_length():
         ("ant", {"api": "brax", "episode_length": 3}, "give it to Brax's EpisodeWrapper"),
     ],
 )
-def test_what_cannot_be_made_is_told_in_one_line(name: str, options: Any, message: str):
+def test_what_cannot_be_made_is_an_error_of_one_line(name: str, options: Any, message: str):
     with pytest.raises(ConfigError, match=message):
         make_env(name, **options)
 

@@ -1,4 +1,4 @@
-"""Checkpoints that cannot be used are told in one line."""
+"""Checkpoints that cannot be used are refused in one line."""
 
 from __future__ import annotations
 

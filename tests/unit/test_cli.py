@@ -293,7 +293,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("command", "key"),
     [*((one, "run.dir") for one in ("play", "export", "view", "serve")), ("train", "run.resume")],
 )
-def test_a_file_in_place_of_a_run_folder_is_said_to_be_no_folder(
+def test_a_file_in_place_of_a_run_folder_is_refused_as_no_folder(
     command: str, key: str, tmp_path: Path
 ) -> None:
     (tmp_path / "policy.npz").write_text("x")

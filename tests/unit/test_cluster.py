@@ -409,7 +409,7 @@ def test_only_what_ray_says_itself_is_a_lost_node() -> None:
             answer.get()
 
 
-def test_what_nodes_say_of_backends_is_heard_with_their_address(tmp_path: Path) -> None:
+def test_messages_of_nodes_about_backends_have_their_address(tmp_path: Path) -> None:
     plan = plan_on(gpus_of_nodes(1, 1), gmis_per_gpu=2)
     launch = make_launch(RunPaths(tmp_path), ["train"] * 4, plan)
     opened = NodeEndpoints(("10.0.0.2", 1), {}, {})

@@ -152,7 +152,9 @@ def test_help_marks_tasks_that_are_not_installed(
         (0, "ball_balance", "gmijax train env=ball_balance"),
     ],
 )
-def test_without_a_gpu_nobody_is_told_to_train_for_hours(num_gpus: int, task: str, command: str):
+def test_without_a_gpu_no_command_that_trains_for_hours_is_suggested(
+    num_gpus: int, task: str, command: str
+):
     purpose, line = training_of(task, has_gpu=bool(num_gpus))
     assert line == command
     assert ("needs a GPU" in purpose) == (task not in command)

@@ -145,7 +145,7 @@ OLD_DRIVER = {"driver": "570.86.10"}
         ({"mujoco": "4.0.0", "mujoco-mjx": "3.17.0"}, {"boards": ()}, "3.17.0 was never tried"),
     ],
 )
-def test_what_is_missing_or_old_is_told_with_the_command_that_brings_it(
+def test_what_is_missing_or_old_is_named_with_the_command_that_installs_it(
     monkeypatch: pytest.MonkeyPatch,
     versions: dict[str, str | None],
     changes: dict[str, Any],
@@ -175,7 +175,7 @@ def test_jax_is_asked_as_a_gmi_would_be_started(monkeypatch: pytest.MonkeyPatch)
     ]
 
 
-def test_a_jax_that_fails_or_hangs_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_a_jax_that_fails_or_hangs_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     program = tmp_path / "python"
     program.write_text("#!/bin/sh\necho 'RuntimeError: no cuda' >&2; exit 1\n")
     program.chmod(0o755)

@@ -22,7 +22,7 @@ from gmijax.workers.training_worker import exchange_used
         ("har", "har", "host", {"intra": "host"}),
     ],
 )
-def test_a_fall_back_to_host_memory_is_told(
+def test_a_fall_back_to_host_memory_is_reported(
     planned: str,
     strategy: str,
     intra: str,

@@ -74,7 +74,7 @@ def test_the_mean_of_three_has_the_same_bits_on_every_way(pool: ThreadPoolExecut
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_ranks_that_ask_for_different_things_are_told_both(
+def test_the_error_of_ranks_that_ask_for_different_things_names_both(
     first: int, pool: ThreadPoolExecutor
 ) -> None:
     """By messages and by a reducer, whoever comes first."""

@@ -14,7 +14,7 @@ from gmijax.sweeps.progress import Progress
 
 
 def events_of(progress: Progress, *changes: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Names of the events with the attempt, where that is told; each change is seen once."""
+    """Names of the events with the attempt, where there is one; each change is seen once."""
     stream = io.StringIO()
     job: Any = SimpleNamespace(number=0, overrides={}, num_timesteps=None, progress=progress)
     events = JobEvents(stream, "pack", [job], SweepPaths(Path("all")))

@@ -1,4 +1,4 @@
-"""What is said of a training that is large for a machine without a GPU."""
+"""Warnings about a training that is large for a machine without a GPU."""
 
 from __future__ import annotations
 

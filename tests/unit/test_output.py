@@ -145,13 +145,13 @@ UNKNOWN = ("async/staleness_mean", "channel/occupancy")
     ],
 )
 def test_a_job_tells_its_rate_and_return_or_of_its_channels(more: dict[str, Any], part: str):
-    assert part in _told([{**SYNC, **more}])
+    assert part in _last_line([{**SYNC, **more}])
 
 
 def test_a_job_tells_its_latest_evaluation():
     evaluated = {**SYNC, "eval/return": 9.5}
-    assert _told([evaluated, SYNC]).endswith("return 7.25  eval 9.50")
-    assert "eval" not in _told([SYNC])
+    assert _last_line([evaluated, SYNC]).endswith("return 7.25  eval 9.50")
+    assert "eval" not in _last_line([SYNC])
 
 
 def test_without_a_terminal_a_line_is_printed_once():
@@ -184,8 +184,8 @@ def test_a_run_that_ended_in_its_first_iteration_says_so(tmp_path: Path):
     assert lines[:2] == ["failed: no env steps in 0:01", "no episode has ended"]
 
 
-def _told(lines: list[dict[str, Any]]) -> str:
-    """What is told in the end of a job that wrote these lines at once."""
+def _last_line(lines: list[dict[str, Any]]) -> str:
+    """The last line of output for a job that wrote these lines at once."""
     return _lines(lines)[-1]
 
 
@@ -227,7 +227,7 @@ WHY = "compiling: once for each task and size, "
 
 
 class Clock:
-    """Stands still unless it is told to go on."""
+    """Stands still unless a test moves it."""
 
     now_s = 1000.0
 
@@ -352,7 +352,7 @@ def test_the_phase_of_several_gmis_is_that_of_the_job(states: tuple[str, ...], p
 
 
 @pytest.mark.parametrize("is_terminal", [False, True])
-def test_what_a_stop_waits_for_is_said_once(is_terminal: bool, monkeypatch: pytest.MonkeyPatch):
+def test_a_stop_names_once_what_it_waits_for(is_terminal: bool, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("gmijax.control.display.REFRESH_S", 0.0)
     output = io.StringIO()
     console = Console(file=output, width=300, force_terminal=is_terminal)

@@ -371,7 +371,7 @@ def test_a_job_that_is_started_again_gets_the_words_to_resume(
     assert first.stop_signal == signal.SIGINT
     assert first.variables["NAME"] == "pack003"
     assert first.variables["OMP_NUM_THREADS"] == "4"
-    assert "MKL_NUM_THREADS" not in first.variables  # The user has said it.
+    assert "MKL_NUM_THREADS" not in first.variables  # The user has set it.
     again = kind.start((job,), slot).process
     assert again.arguments == ("true", "003", "--resume", f"{tmp_path}/003/last")
     assert (tmp_path / "003" / "pack" / "output.log").read_text().splitlines() == [
@@ -450,7 +450,7 @@ def test_a_command_that_a_signal_ended_says_so(tmp_path: Path) -> None:
 
 
 class Gpu(LocalHost):
-    """A machine whose GPU has as much memory in use as is said."""
+    """A machine whose GPU has a given amount of memory in use."""
 
     def __init__(self) -> None:
         super().__init__(GPU)

@@ -38,7 +38,7 @@ def test_bad_descriptor_in_the_environment_is_named(tmp_path: Path, shown: str):
         ChildLink.from_environment(variables)
 
 
-def test_process_that_is_no_gmi_is_told():
+def test_a_process_that_is_no_gmi_gets_an_error():
     with pytest.raises(ConfigError, match="GMIJAX_GMI and GMIJAX_RUN_DIR must be set"):
         ChildLink.from_environment({})
 
@@ -89,7 +89,7 @@ def test_beats_and_errors_reach_whoever_has_the_memory(
     assert described.reason == "exit code 1: KeyboardInterrupt"
 
 
-def test_an_error_is_told_where_nothing_can_be_written(
+def test_an_error_is_reported_where_nothing_can_be_written(
     tmp_path: Path, block: tuple[int, HeartbeatBlock]
 ):
     (tmp_path / "gmi_3").write_text("a file where the folder should be")

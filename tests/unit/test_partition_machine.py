@@ -186,7 +186,7 @@ def test_daemon_gets_none_of_the_users_settings_for_mps(
     )
 
 
-def test_daemon_or_program_that_is_not_there_is_told_in_one_line(tmp_path: Path):
+def test_a_missing_daemon_or_program_is_reported_in_one_line(tmp_path: Path):
     control = MpsControl(script(tmp_path, "echo Cannot find MPS; exit 1"), tmp_path)
     assert not control.is_answering()
     with pytest.raises(BackendUnavailable, match=r"terminate_client 1 2: Cannot find MPS$"):
@@ -274,7 +274,7 @@ def test_a_plan_says_with_which_settings_of_jax_gmis_do_not_compute(
 @pytest.mark.parametrize(
     ("owner", "is_used"), [(os.geteuid(), True), (0, True), (os.geteuid() + 1234, False)]
 )
-def test_a_strangers_daemon_is_not_used(
+def test_a_daemon_of_another_user_is_not_used(
     owner: int, is_used: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     if os.geteuid() != 0:
@@ -303,7 +303,7 @@ def test_a_strangers_daemon_is_not_used(
     assert detect_machine().operator_daemon is None
 
 
-def test_a_link_of_a_strangers_to_a_directory_of_roots_is_not_used(tmp_path: Path):
+def test_a_link_of_another_user_to_a_directory_of_root_is_not_used(tmp_path: Path):
     real, link = tmp_path / "real", tmp_path / "link"
     real.mkdir()
     link.symlink_to(real)

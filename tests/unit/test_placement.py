@@ -77,7 +77,7 @@ def test_what_cannot_be_is_refused(changes, message: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "is_told"),
+    ("overrides", "is_noted"),
     [
         ((), True),
         (("channel.transport=device",), False),
@@ -85,13 +85,13 @@ def test_what_cannot_be_is_refused(changes, message: str) -> None:
         (("plan.serving_gpus=1", "plan.training_gpus=1"), False),
     ],
 )
-def test_jobs_are_told_that_experience_could_stay_on_the_gpu(
-    overrides: tuple[str, ...], is_told: bool, monkeypatch: pytest.MonkeyPatch
+def test_a_plan_notes_that_experience_could_stay_on_the_gpu(
+    overrides: tuple[str, ...], is_noted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reduction, "is_installed", lambda *_: True)
     here, share = machine(2), ("env=ant", "algo=a3c", "plan.backend=share")
     plan = training_plan(compose(*share, *overrides), here)
-    assert any("channel.transport=device keeps" in why for why in plan.reasons) == is_told
+    assert any("channel.transport=device keeps" in why for why in plan.reasons) == is_noted
     if "plan.serving_gpus=1" in overrides:
         config = compose(*share, *overrides, "channel.transport=device")
         with pytest.raises(ConfigError, match="agent 1 is on GPU 0 of the job, where nobody tr"):

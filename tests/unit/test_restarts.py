@@ -123,7 +123,7 @@ def test_a_job_whose_checkpoints_are_all_broken_starts_at_its_origin(job: Job, r
     assert job.started_from == [50, 100, 50]
 
 
-def test_what_cannot_be_had_again_is_told_with_the_fault(job: Job):
+def test_a_backend_that_cannot_start_again_is_named_with_the_fault(job: Job):
     gone = BackendUnavailable("the daemon does not answer")
     message = job.gives_up(job.dies(), job.dies(why=gone))
     assert "cannot start again: the daemon does not answer" in message
@@ -300,7 +300,7 @@ def test_a_lost_gpu_shrinks_the_plan(
         (("run.elastic=true", "plan.gpus=[1]"), r"GPUs \[0\] .* gone, and no other one is left"),
     ],
 )
-def test_what_cannot_go_on_is_told(overrides: tuple[str, ...], message: str):
+def test_jobs_that_cannot_go_on_are_refused(overrides: tuple[str, ...], message: str):
     config = compose("env=ant", "plan.backend=share", *overrides)
     with pytest.raises(ConfigError, match=message):
         with_gpus_left(config, training_plan(config, FOUR), LEFT)

@@ -94,7 +94,7 @@ def test_last_is_the_run_with_the_newest_checkpoint(
     assert last_run("run.dir") == new.root
 
 
-def test_what_last_passes_over_is_said_if_it_is_newer(
+def test_what_last_passes_over_is_named_if_it_is_newer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -107,7 +107,7 @@ def test_what_last_passes_over_is_said_if_it_is_newer(
         os.utime(run.config, (when_s, when_s))
         return run
 
-    def said() -> tuple[str, ...]:
+    def passed_over() -> tuple[str, ...]:
         return choose_checkpoint("last", "run.resume")[1]
 
     chosen = make_run(runs / "chosen", 100)
@@ -115,15 +115,15 @@ def test_what_last_passes_over_is_said_if_it_is_newer(
     begun("older", 1e9)
     begun("served", 3e9, {"policy": "random"})
     (runs / "note").mkdir()
-    assert said() == ()
+    assert passed_over() == ()
     begun("stopped", 3e9)
     job = make_run(runs / "swept" / "000", 50)
     os.utime(job.checkpoint(50) / META, (1e9, 1e9))
     none = "runs/stopped (no checkpoint)"
-    assert said() == (f"last is runs/chosen; newer, but passed over: {none}",)
+    assert passed_over() == (f"last is runs/chosen; newer, but passed over: {none}",)
     os.utime(job.checkpoint(50) / META, (3e9, 3e9))
     swept = "runs/swept (a sweep; its newest run: runs/swept/000)"
-    assert said() == (f"last is runs/chosen; newer, but passed over: {none}, {swept}",)
+    assert passed_over() == (f"last is runs/chosen; newer, but passed over: {none}, {swept}",)
     # Who names a run, means it.
     assert choose_checkpoint("runs/chosen", "run.resume")[1] == ()
 

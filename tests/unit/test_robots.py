@@ -41,7 +41,7 @@ def playground(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def refused(*overrides: str) -> str:
-    """What is said of a command line that is refused."""
+    """The error of a command line that is refused."""
     with pytest.raises(ConfigError) as error:
         require_env(gmijax.compose(*overrides).env)
     return str(error.value)
@@ -137,7 +137,7 @@ def test_where_playground_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> N
     )
 
 
-def test_a_model_that_is_missing_is_said_with_the_line_that_gets_it(
+def test_the_error_of_a_missing_model_has_the_command_that_gets_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.delenv("MENAGERIE_ROOT")

@@ -127,7 +127,7 @@ def test_an_interrupted_search_goes_on_where_it_was(profiles: Use):
     assert result.num_envs == 128
 
 
-def test_what_cannot_run_is_told_and_remembered(profiles: Use):
+def test_what_cannot_run_is_reported_and_remembered(profiles: Use):
     reason = "cannot run on layout [[0,1]]: see [/tmp/x]"  # It may look like markup.
 
     def small(point: Point) -> Measured | NotRunnable:
@@ -142,7 +142,7 @@ def test_what_cannot_run_is_told_and_remembered(profiles: Use):
     assert found()[0].gmis_per_gpu == 2
 
 
-def test_points_for_which_the_host_is_too_small_are_told_and_not_started(
+def test_points_for_which_the_host_is_too_small_are_reported_and_not_started(
     profiles: Use,
 ):
     few = machine(0, host=HostLimits(memory_mib=1500))
@@ -256,7 +256,7 @@ def test_what_is_given_is_not_searched(profiles: Use):
     assert asked == [Point(2, 96, "jax")]
 
 
-def test_one_gmi_is_said_plainly(profiles: Use):
+def test_an_answer_of_one_gmi_is_worded_plainly(profiles: Use):
     profiles(lambda point: Measured(1e6 / point.gmis_per_gpu, 100.0 + point.num_envs, 0.1))
     result, _ = found()
     assert (result.gmis_per_gpu, result.num_envs) == (1, 64)

@@ -155,7 +155,7 @@ def test_poses_are_those_of_mujoco_in_c(impl: str):
 
 
 @pytest.mark.parametrize("impl", ["jax", "warp"])
-def test_a_model_that_an_implementation_refuses_is_told_in_one_line(impl: str):
+def test_a_model_that_an_implementation_refuses_is_an_error_of_one_line(impl: str):
     if impl == "warp":
         pytest.importorskip("warp")
     # 70 degrees of freedom with dense matrices: too many for MJX-Warp. MJX-JAX takes the second

@@ -99,7 +99,7 @@ def env() -> Env:
     return sledge()
 
 
-def test_mujoco_warp_is_told_of_all_that_is_drawn(env: Env):
+def test_mujoco_warp_gets_all_fields_that_are_drawn(env: Env):
     assert {leaf.removeprefix(".") for leaf in drawn(env)} <= set(MODEL_LEAVES)
 
 

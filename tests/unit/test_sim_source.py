@@ -136,7 +136,7 @@ def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pyte
         ("state: state.physics)", "state: state.physics[0])", r"qpos has shape \(\), not a vect"),
     ],
 )
-def test_what_is_wrong_with_a_task_is_told_in_one_line(
+def test_what_is_wrong_with_a_task_is_an_error_of_one_line(
     tmp_path: Path, old: str, new: str, message: str
 ):
     assert TASK.count(old) >= 1

@@ -253,7 +253,7 @@ def test_a_saved_replay_has_to_fit_only_where_it_is_gone_on_with(tmp_path: Path)
     assert line.startswith("replay of 524,288 transitions (MiB")
 
 
-def test_what_is_no_run_folder_is_not_said_to_be_one(tmp_path: Path):
+def test_a_folder_that_is_no_run_folder_is_not_called_one(tmp_path: Path):
     docs = tmp_path / "docs"
     docs.mkdir()
     with pytest.raises(ConfigError, match=r"already; run\.resume=auto continues in it$"):
@@ -386,7 +386,7 @@ def test_auto_takes_what_the_command_says_and_names_it(run: RunPaths):
         assert str(flatten(to_dict(config))[key]) == value
         [note] = find_start_point(config).notes
         assert note.startswith(f"changed since the run: {key} is {value}, was ")
-    # A file of settings that is chosen is said, too.
+    # The notes name a chosen file of settings, too.
     tuned = config_of(run.root, "tuned=humanoid_ppo")
     notes = find_start_point(tuned).notes
     assert any("algo.gae_lambda" not in note for note in notes)

@@ -72,7 +72,7 @@ def full(*_: Any, **__: Any) -> Any:
 
 
 class FullStudy(Study[Job]):
-    """Cannot be written when it is told of a job, or asked about one."""
+    """Cannot be written when a job is added to it, or when it is asked about one."""
 
     tell = full
     is_hopeless = full
@@ -102,15 +102,15 @@ def test_a_sweep_that_cannot_write_asks_running_jobs_to_save(
 
 
 def orders_of(
-    sweep: Sweep, monkeypatch: pytest.MonkeyPatch, deaf_to: Collection[str] = ()
+    sweep: Sweep, monkeypatch: pytest.MonkeyPatch, ignored: Collection[str] = ()
 ) -> list[str]:
-    """What jobs are told from now on; to the orders `deaf_to` they do nothing."""
+    """The orders to jobs from now on; the orders in `ignored` have no effect."""
     orders: list[str] = []
     for node in sweep.nodes:
 
         def order(child: int, do: Any, old: Any = node.order) -> None:
             orders.append(do)
-            if do not in deaf_to:
+            if do not in ignored:
                 old(child, do)
 
         monkeypatch.setattr(node, "order", order)
@@ -130,7 +130,7 @@ def test_jobs_are_asked_once_and_once_more_if_it_becomes_urgent(
     numbers: list[int], expected: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sweep, signals = Sweep(tmp_path, jobs(1)), StopSignals()
-    orders = orders_of(sweep, monkeypatch, deaf_to=("interrupt", "ask_to_stop"))
+    orders = orders_of(sweep, monkeypatch, ignored=("interrupt", "ask_to_stop"))
 
     def wait() -> None: ...
 
@@ -149,11 +149,11 @@ def test_jobs_are_asked_once_and_once_more_if_it_becomes_urgent(
     ("exit_code", "state"),
     [(-signal.SIGINT, "interrupted"), (-signal.SIGTERM, "interrupted"), (-9, "waiting")],
 )
-def test_a_controller_that_is_asked_before_it_hears_signals_is_interrupted(
+def test_a_controller_that_is_asked_before_it_handles_signals_is_interrupted(
     exit_code: int, state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sweep, signals = Sweep(tmp_path, jobs(1)), StopSignals()
-    orders_of(sweep, monkeypatch, deaf_to=("interrupt", "ask_to_stop"))
+    orders_of(sweep, monkeypatch, ignored=("interrupt", "ask_to_stop"))
     end = partial(sweep.nodes[0].end, exit_code)
     with pytest.raises(JobInterrupted):
         sweep.run(partial(signals.handle, signal.SIGINT), end, signals=signals)
@@ -182,7 +182,7 @@ def test_only_urgent_signals_give_jobs_a_time_to_end(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sweep, signals = Sweep(tmp_path, jobs(1)), StopSignals()
-    orders = orders_of(sweep, monkeypatch, deaf_to=("interrupt", "ask_to_stop"))
+    orders = orders_of(sweep, monkeypatch, ignored=("interrupt", "ask_to_stop"))
     clock_s = [running_s()]
     monkeypatch.setattr("gmijax.sweeps.running.running_s", lambda: clock_s[0])
 
@@ -316,7 +316,7 @@ def test_an_order_that_cannot_be_written_is_named(
         (("true", "x" * 2**20), None, "true: Argument list too long"),
     ],
 )
-def test_what_is_wrong_with_one_command_is_said_and_is_no_error_of_all(
+def test_what_is_wrong_with_one_command_is_named_and_is_no_error_of_all(
     arguments: tuple[str, ...],
     cwd: str | None,
     reason: str,

@@ -88,7 +88,7 @@ class FakeHost(LocalHost):
 
 
 class Sweep:
-    """Jobs on two nodes, with two slots each unless told otherwise."""
+    """Jobs on two nodes, with two slots each by default."""
 
     def __init__(self, folder: Path, jobs: Iterable[Job], **settings: Any) -> None:
         self.jobs, self.paths = list(jobs), SweepPaths(folder)

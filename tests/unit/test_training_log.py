@@ -57,7 +57,7 @@ def test_a_loss_that_is_not_finite_is_named() -> None:
         report(TrainingLog("point_mass", (), 0), 64, spoilt, {})
 
 
-def test_the_first_overflow_is_told_and_all_are_logged(
+def test_the_first_overflow_is_reported_and_all_are_logged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sink = JsonlSink(tmp_path / "metrics.jsonl")
