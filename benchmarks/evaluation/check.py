@@ -1,7 +1,7 @@
 """Compares the figures in README.md and docs/ with the files of results.
 
 A figure in a text stands in a marker, `<!-- figure: FILE.json#PATH FORMAT -->1.42<!-- /figure -->`
-(`figures.look_up` says what a path is; the format is Python's), and a table between
+(`figures.look_up` describes the path; the format is Python's), and a table between
 `<!-- table: NAME -->` and `<!-- /table -->`. `fill` writes what belongs there. What looks like a
 measurement elsewhere is a finding, but for code and lines that end with `<!-- no figure -->`:
 limits, examples, and what others report; `excused` counts them. Figures of a decision are of its
@@ -54,7 +54,7 @@ def documents(root: Path = ROOT) -> list[Path]:
 
 
 def fill(text: str) -> str:
-    """A document with every marked figure and table as the files say.
+    """A document with every marked figure and table filled in from the files.
 
     Raises:
       ConfigError: a figure without a file, or a table that is none of ours.
@@ -64,7 +64,7 @@ def fill(text: str) -> str:
 
 
 def check(root: Path = ROOT) -> list[Finding]:
-    """All findings; none means that every figure is as its file says."""
+    """All findings; none means that every figure agrees with its file."""
     found = [finding for path in documents(root) for finding in in_document(path, root)]
     for name in PICTURES:
         if not is_current(name):

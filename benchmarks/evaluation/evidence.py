@@ -22,7 +22,7 @@ class Source(NamedTuple):
     Attributes:
       file: its name without `.json`.
       has_origin: whether commit and date of the call are known.
-      gpu: its kind, e.g. `H200`; empty if there was none or the file does not say.
+      gpu: its kind, e.g. `H200`; empty if there was none or the file does not have it.
     """
 
     file: str
@@ -50,7 +50,7 @@ class Evidence(NamedTuple):
 
     @property
     def is_enough(self) -> bool:
-        """Whether a reader can believe it: commit, date and `LEAST` runs."""
+        """Whether it has commit, date and at least `LEAST` runs."""
         return self.has_origin and self.repeats >= LEAST
 
     def __str__(self) -> str:

@@ -1,6 +1,6 @@
 """Refuses files without a commit, and figures of few runs that `benchmarks/plan.md` does not name.
 
-On the front page no figure of few runs may stand. The plan has a table of the files with one or
+The front page may have no figure of few runs. The plan has a table of the files with one or
 two runs of the figures in a row.
 """
 
@@ -54,7 +54,7 @@ def unplanned(tables: WordTables = WORD_TABLES, plan: Path = PLAN) -> Iterator[F
 
 
 def _planned(text: str) -> dict[str, int]:
-    """Names of files in the first column of the table, and the lines where they stand."""
+    """Names of files in the first column of the table, and the numbers of their lines."""
     if (found := re.search(f"^{re.escape(SELDOM)}", text, re.MULTILINE)) is None:
         return {}
     begin, end = found.start(), text.find("\n## ", found.start())

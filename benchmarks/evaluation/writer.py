@@ -36,7 +36,7 @@ def table(
       name: in documents.
       head: see `markdown`.
       files: of results that its figures are from.
-      more: such files, where results say which.
+      more: further files, found when the table is made.
     """
 
     def make(rows: MakeRows) -> list[str]:
@@ -168,7 +168,7 @@ def line_of(file: str, call: Call | None, note: str = "") -> str:
 
 
 def origin(call: Call) -> str:
-    """Commit, date, device, driver and repeats of a call; `unknown` where the file is silent."""
+    """Commit, date, device, driver and repeats of a call; `unknown` where the file has none."""
     commits = [one[:10] for one in (call.commit or "unknown").split(", ")]
     parts = [f"commit {', '.join(commits)}" + (" with changes" if call.is_dirty else "")]
     parts.append(call.date[:10] if call.date else "date unknown")

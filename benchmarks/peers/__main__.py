@@ -76,7 +76,7 @@ class Benchmark:
         return any("failed" in run for runs in self._runs.values() for run in runs)
 
     def run(self) -> None:
-        """Compiles, then runs every side as often as wanted, all once before one comes twice."""
+        """Compiles, then runs every side as often as wanted, each once before any is repeated."""
         at_once = max(1, (os.cpu_count() or 1) // 2)
         for first in range(0, len(self._sides), at_once):
             self._compile(self._sides[first : first + at_once])
@@ -159,7 +159,7 @@ def wanted_sides(
 ) -> Iterator[Side]:
     """Both sides of the comparisons with one of `only` in the name, of those to be had here.
 
-    `places` says of peers that are not packages of this environment where they are, see `Side`.
+    `places` has the path of each peer that is not a package of this environment, see `Side`.
 
     Raises:
       ConfigError: no comparison has that in its name, or an override is wrong.

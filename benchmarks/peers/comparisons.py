@@ -126,7 +126,7 @@ COMPARISONS: Mapping[str, Comparison] = MappingProxyType(
 
 
 def case_name(comparison: str, trainer: str) -> str:
-    """Under which the runs of one side stand."""
+    """The key of one side's runs in the file of results."""
     return f"{comparison}, {trainer}"
 
 
