@@ -124,7 +124,7 @@ def test_what_last_passes_over_is_named_if_it_is_newer(
     os.utime(job.checkpoint(50) / META, (3e9, 3e9))
     swept = "runs/swept (a sweep; its newest run: runs/swept/000)"
     assert passed_over() == (f"last is runs/chosen; newer, but passed over: {none}, {swept}",)
-    # Who names a run, means it.
+    # A run that is named is taken without a note.
     assert choose_checkpoint("runs/chosen", "run.resume")[1] == ()
 
 

@@ -95,7 +95,7 @@ def test_the_manager_says_what_is_missing() -> None:
         manager.allreduce(np.ones(1))
 
 
-def test_roles_talk_only_in_a_gmi() -> None:
+def test_roles_communicate_only_in_a_gmi() -> None:
     with pytest.raises(ConfigError, match=r"^send: only inside a GMI"):
         Talk(1).send(1, 0)
     with pytest.raises(ConfigError, match=r"^rank: only inside a GMI"):

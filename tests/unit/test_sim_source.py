@@ -89,9 +89,9 @@ def test_a_task_gets_the_weights_and_settings_that_it_takes(tmp_path: Path):
 def test_a_curriculum_needs_a_task_that_carries_something_on(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"^env\.curriculum: .* no argument `curriculum` to"):
         make_env(written(tmp_path, TASK), curriculum=True)
-    deaf = TASK.replace("impl, max_envs", "impl, max_envs, curriculum=False")
+    without_curriculum = TASK.replace("impl, max_envs", "impl, max_envs, curriculum=False")
     with pytest.raises(ConfigError, match=r"^env\.curriculum=on: point has no next_episode"):
-        make_env(written(tmp_path, deaf), curriculum=True)
+        make_env(written(tmp_path, without_curriculum), curriculum=True)
 
 
 def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -190,7 +190,7 @@ def test_a_length_that_cannot_be_is_refused_before_memory_is_taken(
         with pytest.raises(CollectiveError, match="GMI 0 sends a message of"):
             reader.try_get()
         with suppress(ConnectionError):
-            while connection.recv(4096):  # It is hung up on.
+            while connection.recv(4096):  # Until the other end closes it.
                 pass
     reader.close()
 

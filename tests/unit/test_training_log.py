@@ -65,7 +65,7 @@ def test_the_first_overflow_is_reported_and_all_are_logged(
     for iteration, count in enumerate((0, 5, 7), start=1):
         full = dict.fromkeys(OVERFLOWS, 0) | {"contact": count}
         report(log, 64 * iteration, metrics_from(_counts(full)), {})
-    # Where nothing can overflow no line speaks of it.
+    # Where nothing can overflow there is no line about it.
     report(TrainingLog("point_mass", (sink,), 0), 64, metrics_from(_counts()), {})
     sink.close()
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
