@@ -13,7 +13,7 @@ from gmijax.runs.folder import write_text
 
 
 def main() -> int:
-    """Does what it is told; returns 1 if a figure is not that of its file, 2 on bad input."""
+    """Runs one command; returns 1 if a figure is not that of its file, 2 on bad input."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("check", help="compare README.md and docs/ with benchmarks/results")

@@ -14,7 +14,7 @@ import pynvml
 from gmijax.machine.nvidia import nvml_session
 
 EVERY_S = 0.25
-"""The monitor wants a tenth of a second at least."""
+"""Seconds between samples. The monitor needs a tenth of a second at least."""
 
 
 class BusySms:

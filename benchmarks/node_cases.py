@@ -61,7 +61,7 @@ def cases_of(
 ) -> list[Case]:
     """The jobs with so many on each GPU, on one node and on two.
 
-    What needs NCCL is left out if there is a reason against it, with a line that says so.
+    What needs NCCL is left out if there is a reason against it, with a line about it.
     """
     jobs = (ONE_NODE, TWO_NODES["jobs"])
     found = [

@@ -1,7 +1,7 @@
 """Whether a run succeeded, and how the seeds of one setting compare with those of another.
 
 Pure functions on lines of `metrics.jsonl`. A run has succeeded if it did not lose what it had
-learnt, or, where the task says what is wanted, if it does that in the end.
+learnt, or, where the task has a goal in numbers, if it reaches that in the end.
 """
 
 from __future__ import annotations
@@ -93,8 +93,8 @@ def rewards(lines: Lines) -> list[float]:
 def succeeded(task: str, lines: Lines) -> bool:
     """Whether a training with these metrics succeeded at `task`.
 
-    What the task wants is seen in at least `OPENED` of the latest episodes; where it wants nothing
-    by number, the smoothed reward of a step ends at `LAST_TO_PEAK` of its peak or above.
+    The goal of the task is reached in at least `OPENED` of the latest episodes; where it has none
+    in numbers, the smoothed reward of a step ends at `LAST_TO_PEAK` of its peak or above.
     """
     if task in _WANTED:
         name, least = _WANTED[task]

@@ -43,7 +43,7 @@ _SAME = ("commit", "is_dirty", "host", "device", "driver", "versions")
 
 
 class Call(NamedTuple):
-    """One command on one machine; what a file does not say is None.
+    """One command on one machine; what a file does not have is None.
 
     Attributes:
       commit: of the code.
@@ -71,7 +71,7 @@ class Call(NamedTuple):
 
 
 class ResultsFile:
-    """The results of a call that goes on, in memory and on disk.
+    """The results of a running call, in memory and on disk.
 
     Attributes:
       path: the file; it has the call after the first change.

@@ -72,7 +72,7 @@ def measure(
       GmiFailed: a probe does not work here.
       JobInterrupted: a signal came.
     """
-    # The GMIs meet for rings if one of the probes has some.
+    # The GMIs connect for rings if one of the probes needs one.
     rings = any(needs_ring(probe.strategy, plan.layout) for probe in probes)
     plan = dataclasses.replace(plan, strategy="har" if rings else "mpr", intra="host")
     numbers = range(len(probes))

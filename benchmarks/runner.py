@@ -22,7 +22,7 @@ from gmijax.runs.folder import read_json
 from gmijax.supervise.failures import last_line
 
 STOP_S = 15.0
-"""For a command that meets its deadline to save and end."""
+"""Time for a command that has reached its deadline to save and end."""
 
 _ROOT = Path(__file__).resolve().parents[1]
 
@@ -63,7 +63,7 @@ def in_turn(
     deadline_s: float = math.inf,
     like: Callable[[Case], Hashable] = lambda case: case,
 ) -> Iterator[tuple[int, Case]]:
-    """The number of the repeat and the case: every case once before one comes twice.
+    """The number of the repeat and the case: every case once before any is repeated.
 
     A case that would not end in time is left out. It is expected to take as long as the longest
     one before that is like it; the time of a case is what passes until the next one is asked for.
@@ -86,14 +86,14 @@ def start(
     Args:
       command: with its arguments.
       variables: of the environment, beside those of this process.
-      output: where its output goes; None: where that of this process goes.
+      output: gets its output; None: the output of this process does.
     """
     return subprocess.Popen(
         command,
         env={**os.environ, **variables},
         stdout=output,
         stderr=output,
-        start_new_session=True,  # So that Ctrl-C comes to it once.
+        start_new_session=True,  # So that it gets Ctrl-C only once.
     )
 
 

@@ -58,7 +58,7 @@ def train(
     baseline: Sequence[Outcome] | None,
     deadline_s: float,
 ) -> Sequence[Outcome]:
-    """Trains a row and writes it down, what is through too if it is interrupted."""
+    """Trains a row and writes it to the file; if interrupted, the finished runs of it."""
     task = file.results["task"]
     words = [
         *(*given.overrides, *row.overrides, f"seed=range({given.seeds})"),

@@ -33,7 +33,7 @@ def are_alike(jobs: Sequence[Mapping[str, Any]]) -> bool:
 
 
 def rate_of_jobs(jobs: Sequence[Mapping[str, Any]]) -> float | None:
-    """Steps per second of all jobs of a pack together; None of a mix, whose sum says nothing."""
+    """Steps per second of all jobs of a pack together; None of a mix, whose sum has no meaning."""
     return sum(job["env_steps_per_s"] or 0.0 for job in jobs) if are_alike(jobs) else None
 
 

@@ -4,8 +4,8 @@ The same runs as sweeps with one at a time, several under MPS, several under pla
 several as one program, a mix of tasks, and as many as `auto` takes. A sweep counts from the start
 of its first job to the end of its last, start-up included; beside it stand the steps per second
 while all slots are busy.
-Writes `benchmarks/results/sweeps-<device>.json` after every sweep. What is interrupted or meets
-the deadline keeps what is through; a sweep that would not end in time is not started.
+Writes `benchmarks/results/sweeps-<device>.json` after every sweep. A call that is interrupted
+or reaches its deadline keeps the finished sweeps; one that would not end in time is not started.
 """
 
 from __future__ import annotations

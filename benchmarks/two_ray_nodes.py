@@ -45,23 +45,23 @@ class Cluster:
 
     def __init__(self, process: subprocess.Popen[bytes], log: Path) -> None:
         self._process, self._log = process, log
-        self._hear()
+        self._read_nodes()
 
     def add_node(self) -> None:
         """Adds one in place of the second, which was killed."""
         assert self._process.stdin is not None
         self._process.stdin.write(b"add\n")
         self._process.stdin.flush()
-        self._hear()
+        self._read_nodes()
 
-    def _hear(self) -> None:
+    def _read_nodes(self) -> None:
         assert self._process.stdout is not None
         lines = (json.loads(line) for line in self._process.stdout if line.startswith(b"{"))
-        said: dict[str, Any] | None = next(lines, None)
-        if said is None:
+        nodes: dict[str, Any] | None = next(lines, None)
+        if nodes is None:
             raise ConfigError(f"no two nodes of Ray: {last_line(self._log)}")
-        self.address = f"cluster.address={said['address']}"
-        self.second_raylet: int = said["second_raylet"]
+        self.address = f"cluster.address={nodes['address']}"
+        self.second_raylet: int = nodes["second_raylet"]
 
 
 @contextmanager
@@ -104,8 +104,8 @@ def main() -> None:
         while True:
             second = cluster.add_node(**other)
             raylet = second.all_processes["raylet"][0].process.pid
-            said = {"address": cluster.address, "second_raylet": raylet}
-            sys.stdout.write(f"\n{json.dumps(said)}\n")
+            nodes = {"address": cluster.address, "second_raylet": raylet}
+            sys.stdout.write(f"\n{json.dumps(nodes)}\n")
             sys.stdout.flush()
             if not sys.stdin.readline():
                 break

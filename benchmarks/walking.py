@@ -132,7 +132,7 @@ class Benchmark:
     def _refuse_a_script_that_cannot_train(self) -> None:
         """Raises ConfigError if its first training left nothing although there was time.
 
-        Its exit code says nothing: it may fail at its film.
+        Its exit code is no sign: it may fail at its film.
         """
         is_first = all(run["trainer"] != SCRIPT for run in self.runs)
         if is_first and time.monotonic() < self._trained_by_s:
@@ -237,7 +237,7 @@ def _without_folder(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_tested(run: Mapping[str, Any]) -> bool:
-    """Whether the tests of a training were enough to say if it walks.
+    """Whether the tests of a training were enough to decide whether it walks.
 
     The deadline may have ended them.
     """
@@ -285,7 +285,7 @@ def _ours(folder: Path, started_s: float) -> list[dict[str, Any]]:
 
 
 def _theirs(folder: Path, started_s: float) -> list[dict[str, Any]]:
-    """As `_ours`, of Playground's script, which does not say when it made its first step."""
+    """As `_ours`, of Playground's script, which does not record when it made its first step."""
     found = sorted(folder.glob(f"*/checkpoints/*/{BRAX_CONFIG}"))
     return [
         {

@@ -1,7 +1,7 @@
 """Agents and trainers of the tests of channels: processes without jax.
 
 Every unroll has a number and says so in all its values, so that a trainer sees at once whether
-what it got is whole, and its list of numbers tells what was lost or came twice.
+what it got is whole, and its list of numbers shows what was lost or came twice.
 """
 
 from __future__ import annotations

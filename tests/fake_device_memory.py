@@ -91,8 +91,8 @@ class FakeQueue:
         self._clocked_s += time.monotonic() - self._started_s
 
     def clocked_s(self) -> float:
-        told, self._clocked_s = self._clocked_s, 0.0
-        return told
+        seconds, self._clocked_s = self._clocked_s, 0.0
+        return seconds
 
     def close(self) -> None:
         pass

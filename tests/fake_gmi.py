@@ -52,7 +52,7 @@ def long_iteration(link: ChildLink) -> None:
     train(link)
 
 
-def deaf(link: ChildLink) -> None:
+def ignore_stop(link: ChildLink) -> None:
     """Never looks at requests to stop, beats on."""
     while True:
         link.beat("running", 1)
@@ -60,7 +60,7 @@ def deaf(link: ChildLink) -> None:
 
 
 def stubborn(link: ChildLink) -> None:
-    """Is stopped, so that it can hear no order."""
+    """Is stopped, so that it cannot obey an order."""
     link.beat("running", 1)
     write_json(link.paths.root / "helper.json", {"pid": os.getpid()})
     os.kill(os.getpid(), signal.SIGSTOP)
@@ -185,9 +185,9 @@ def mps_client_in_a_call(link: ChildLink) -> None:
 MODES: dict[str, Callable[[ChildLink], None]] = {
     mode.__name__: mode
     for mode in (
-        *(clean, train, deaf, stubborn, busy, exit_3, raise_value_error, raise_config_error),
+        *(clean, train, ignore_stop, stubborn, busy, exit_3, raise_value_error),
         *(lose_peer, wait_in_vain, die_late, die_soon, stall, silent, mps_client, linger),
-        *(exit_beside_stopped, mps_client_in_a_call, long_iteration),
+        *(raise_config_error, exit_beside_stopped, mps_client_in_a_call, long_iteration),
     )
 }
 

@@ -1,4 +1,4 @@
-"""A fake `nvidia-cuda-mps-control` in PATH, and what it was told."""
+"""A fake `nvidia-cuda-mps-control` in PATH, and the commands that it got."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class FakeMps:
         # What is no client by then is none.
         monkeypatch.setattr("gmijax.supervise.backends.mps._CLIENTS_APPEAR_S", 1.0)
 
-    def told(self, command: str) -> list[list[str]]:
+    def commands(self, command: str) -> list[list[str]]:
         """Arguments of every `command` so far."""
         lines = self.journal.read_text().splitlines() if self.journal.exists() else []
         return [line.split()[1:] for line in lines if line.split()[0] == command]
 
     def pipe_directories(self) -> list[Path]:
         """Of all daemons that were started."""
-        return [Path(directory) for _, directory in self.told("start")]
+        return [Path(directory) for _, directory in self.commands("start")]
 
     def left(self) -> list[Path]:
         """Pipe directories of daemons that are still there."""

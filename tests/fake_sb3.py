@@ -10,7 +10,7 @@ import pytest
 
 
 class VecEnv:
-    """Its base class: keeps what it is told, and seeds of the next reset."""
+    """Its base class: keeps its arguments, and seeds of the next reset."""
 
     def __init__(self, num_envs: int, observation_space: Any, action_space: Any) -> None:
         self.num_envs = num_envs

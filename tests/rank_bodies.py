@@ -139,7 +139,7 @@ def step_in_different_orders(comm: Communicator, options: Options) -> Options:
 
 
 def check_order(comm: Communicator, options: Options) -> Options:
-    """Makes many calls of both kinds with random pauses; every value tells its step."""
+    """Makes many calls of both kinds with random pauses; every value holds its step."""
     kinds = np.random.default_rng(0).random(options["num_ordered_calls"])
     pauses = np.random.default_rng([1, comm.rank])
     ranks, take_mean = np.arange(comm.world_size), mean_of(comm, options["num_floats"])

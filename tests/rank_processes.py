@@ -111,12 +111,12 @@ class Ranks:
         deadline = time.monotonic() + WAIT_S
         for rank, process in self.processes.items():
             while not (self.folder / f"{mark}_{rank}").exists():
-                said = self.folder / f"stderr_{rank}"
-                assert time.monotonic() < deadline, f"no {mark}: {said.read_text()}"
+                stderr = self.folder / f"stderr_{rank}"
+                assert time.monotonic() < deadline, f"no {mark}: {stderr.read_text()}"
                 # It may leave the mark and end, in this order, since we looked.
                 has_ended = process.ends_within(0.01)
                 assert not has_ended or (self.folder / f"{mark}_{rank}").exists(), (
-                    f"no {mark}: {said.read_text()}"
+                    f"no {mark}: {stderr.read_text()}"
                 )
 
     def named_memory(self) -> set[Path]:
@@ -162,8 +162,8 @@ class Ranks:
             process.send_signal(signal.SIGUSR1)  # It says where it is, see `main`.
             time.sleep(1.0)
             has_result = (self.folder / f"result_{rank}").exists()
-            said = (self.folder / f"stderr_{rank}").read_text()
-            pytest.fail(f"rank {rank} does not end, has a result: {has_result}\n{said}")
+            stderr = (self.folder / f"stderr_{rank}").read_text()
+            pytest.fail(f"rank {rank} does not end, has a result: {has_result}\n{stderr}")
 
 
 def start_rank(options: Options, inherited: dict[str, int], stderr: int) -> RankProcess:

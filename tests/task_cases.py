@@ -1,4 +1,4 @@
-"""What the contract test must be told of every task: a way to die, and how near C MuJoCo it is."""
+"""What the contract test has to know of a task: a way to die, and how near C MuJoCo it is."""
 
 from __future__ import annotations
 

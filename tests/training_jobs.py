@@ -122,7 +122,7 @@ def wait_until(
 
 
 def heartbeat_of(run: Path, gmi: int) -> Heartbeat | None:
-    """What a GMI last said of itself, from its memory; None if it does not run."""
+    """The last heartbeat of a GMI, from its memory; None if it does not run."""
     for pid in pids_of(run):
         try:
             variables = dict(
@@ -169,7 +169,7 @@ def pids_of(run: Path) -> list[int]:
 
 
 def gmi_pid(run: Path, gmi: int) -> int | None:
-    """The process of a GMI, None if it has not said so yet."""
+    """The process of a GMI, None if it has not reported it yet."""
     beat = heartbeat_of(run, gmi)
     return None if beat is None else beat.pid
 

@@ -1,4 +1,4 @@
-"""A browser's part in the viewer: a websocket that speaks viser's messages."""
+"""A browser's part in the viewer: a websocket with viser's messages."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Client:
         self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
 
     def look(self) -> None:
-        """Tells where its camera is; from then on it counts as connected."""
+        """Sends where its camera is; from then on it counts as connected."""
         self.send(
             "ViewerCameraMessage",
             wxyz=(1, 0, 0, 0),

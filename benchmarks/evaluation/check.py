@@ -1,12 +1,13 @@
 """Compares the figures in README.md and docs/ with the files of results.
 
 A figure in a text stands in a marker, `<!-- figure: FILE.json#PATH FORMAT -->1.42<!-- /figure -->`
-(`figures.look_up` says what a path is; the format is Python's), and a table between
+(`figures.look_up` describes the path; the format is Python's), and a table between
 `<!-- table: NAME -->` and `<!-- /table -->`. `fill` writes what belongs there. What looks like a
 measurement elsewhere is a finding, but for code and lines that end with `<!-- no figure -->`:
 limits, examples, and what others report; `excused` counts them. Figures of a decision are of its
-day: one that says "as measured then" may have some without a file. What few runs or no commit back
-is said beside it (`repeats`) and named in `benchmarks/plan.md` (`planned`).
+day: one with the words "as measured then" may have some without a file. A document has to state
+how many runs a figure has if they are few (`repeats`), and `benchmarks/plan.md` has to name every
+figure of few runs or without a commit (`planned`).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from benchmarks.evaluation.finding import Finding
 from benchmarks.evaluation.page import TABLES
 from benchmarks.evaluation.planned import unplanned, without_commit
 from benchmarks.evaluation.plots import FOLDER, PICTURES, is_current
-from benchmarks.evaluation.repeats import runs_said
+from benchmarks.evaluation.repeats import overstated_runs
 from gmijax.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
@@ -47,13 +48,13 @@ MEASUREMENTS = tuple(
 
 
 def documents(root: Path = ROOT) -> list[Path]:
-    """All that is checked."""
+    """All documents that are checked."""
     found = [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
     return [path for path in found if path.exists()]
 
 
 def fill(text: str) -> str:
-    """A document with every marked figure and table as the files say.
+    """A document with every marked figure and table filled in from the files.
 
     Raises:
       ConfigError: a figure without a file, or a table that is none of ours.
@@ -63,7 +64,7 @@ def fill(text: str) -> str:
 
 
 def check(root: Path = ROOT) -> list[Finding]:
-    """All findings; none means that every figure is as its file says."""
+    """All findings; none means that every figure agrees with its file."""
     found = [finding for path in documents(root) for finding in in_document(path, root)]
     for name in PICTURES:
         if not is_current(name):
@@ -86,7 +87,7 @@ def count(root: Path = ROOT) -> Count:
 
 
 def excused(root: Path = ROOT) -> int:
-    """Lines that say that what looks like a measurement is none of ours."""
+    """Number of lines marked as not being a measurement of this project."""
     return sum(path.read_text().count(NO_FIGURE) for path in documents(root))
 
 
@@ -96,33 +97,33 @@ def in_document(path: Path, root: Path = ROOT) -> Iterator[Finding]:
     for match in (*FIGURE.finditer(text), *TABLE.finditer(text)):
         yield from _compared(name, text, match)
     if path.parent.name != "decisions":
-        yield from runs_said(name, text, FIGURE)
+        yield from overstated_runs(name, text, FIGURE)
     if path.parent.name != "decisions" or OF_ITS_DAY not in text:
         yield from _unmarked(name, text)
 
 
 def _compared(name: str, text: str, match: re.Match[str]) -> Iterator[Finding]:
-    """What a marked figure or table differs in."""
+    """Findings where a marked figure or table differs from its files."""
     line = text.count("\n", 0, match.start()) + 1
-    stands = match[len(match.groups()) - 1]
+    written = match[len(match.groups()) - 1]
     try:
         wanted = _figure(match[2], match[3]) if match.re is FIGURE else _table(match[2])
     except (ConfigError, ValueError) as error:
-        yield Finding(name, line, stands, str(error))
+        yield Finding(name, line, written, str(error))
         return
     if match.re is TABLE:
-        yield from _differences(name, stands, wanted, line + 1)
-    elif stands != wanted:
-        yield Finding(name, line, stands, f"{match[2]} is {wanted}")
+        yield from _differences(name, written, wanted, line + 1)
+    elif written != wanted:
+        yield Finding(name, line, written, f"{match[2]} is {wanted}")
 
 
-def _differences(name: str, stands: str, wanted: str, first: int = 1) -> Iterator[Finding]:
-    old, new = stands.splitlines(), wanted.splitlines()
+def _differences(name: str, written: str, wanted: str, first: int = 1) -> Iterator[Finding]:
+    old, new = written.splitlines(), wanted.splitlines()
     for tag, a, b, c, d in difflib.SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
         if tag != "equal":
             line = first + a
-            said = f"the files say {' / '.join(new[c:d])!r}"
-            yield Finding(name, line, " / ".join(old[a:b]), said)
+            problem = f"the files say {' / '.join(new[c:d])!r}"
+            yield Finding(name, line, " / ".join(old[a:b]), problem)
 
 
 def _unmarked(name: str, text: str) -> Iterator[Finding]:

@@ -1,10 +1,10 @@
-"""Counts the figures of documents, and those of them that a reviewer believes.
+"""Counts the figures of documents, and those of them that are well supported.
 
 A figure is a marked one, or a cell with a digit in a column of numbers that are measured. It is
-believed if its file has commit and date, and it is of three runs or more. A cell says of how many
-it is (`n=3`, `5 of 20`); one that does not is of as many as every case of its files, at least one;
-a ratio, of as many as the cells of its row. Files are those below a table, or the one that a row
-names. Not counted: tables of words, which repeat figures of others.
+supported if its file has commit and date, and at least three runs are behind it. A cell may state
+their number (`n=3`, `5 of 20`); without one it has as many as every case of its files, at least
+one; a ratio has as many as the cells of its row. Files are those below a table, or the one that a
+row names. Not counted: tables of words, which repeat figures of others.
 """
 
 from __future__ import annotations
@@ -41,25 +41,25 @@ _REPEATS = re.compile(r"(\d+)(?: to \d+)? runs? of each case")
 
 
 class Count(NamedTuple):
-    """Figures.
+    """A number of figures.
 
     Attributes:
-      all: of them.
-      believed: with commit, date and enough runs.
+      all: figures.
+      supported: those with commit, date and enough runs.
     """
 
     all: int = 0
-    believed: int = 0
+    supported: int = 0
 
     def __add__(self, other: tuple[int, ...]) -> Count:
-        return Count(self.all + other[0], self.believed + other[1])
+        return Count(self.all + other[0], self.supported + other[1])
 
     def __str__(self) -> str:
-        return f"figures: {self.all}, with commit, date and n>={LEAST}: {self.believed}"
+        return f"figures: {self.all}, with commit, date and n>={LEAST}: {self.supported}"
 
 
 def of_figure(reference: str) -> Count:
-    """Of a marked figure; one whose file is gone is not believed."""
+    """The count of one marked figure; it is not supported if its file is gone."""
     try:
         call, values = look_up_all(reference)
     except ConfigError:
@@ -69,7 +69,7 @@ def of_figure(reference: str) -> Count:
 
 
 def of_table(text: str) -> Count:
-    """Of a table as it stands in a document: one head or several, files below each."""
+    """The count of a table as a document has it: one head or several, files below each."""
     total = Count()
     lines = text.splitlines()
     rules = [at for at, line in enumerate(lines) if re.match(r"\| ---", line)]

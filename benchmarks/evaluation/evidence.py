@@ -1,6 +1,6 @@
-"""What a figure is of: how many runs, and files of results whose commit and date are known or not.
+"""The evidence of a figure: the number of runs behind it, and the files of results it is from.
 
-Figures keep it (`figures.Figure`), and so do their ratios and what a table of words says.
+Figures keep it (`figures.Figure`), and so do their ratios and their text in a table of words.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from benchmarks.records import Call
 from gmijax.runs.names import counted
 
 LEAST = 3
-"""Runs of each case that a reader may ask for."""
+"""Runs of each case that a figure needs before a reader can rely on it."""
 
 
 class Source(NamedTuple):
@@ -22,7 +22,7 @@ class Source(NamedTuple):
     Attributes:
       file: its name without `.json`.
       has_origin: whether commit and date of the call are known.
-      gpu: its kind, e.g. `H200`; empty if there was none or the file does not say.
+      gpu: its kind, e.g. `H200`; empty if there was none or the file does not have it.
     """
 
     file: str
@@ -31,11 +31,11 @@ class Source(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What one figure, or several together, are of.
+    """The runs and files behind one figure, or behind several together.
 
     Attributes:
       repeats: runs of the case that ran least often.
-      sources: of all of them.
+      sources: the calls that all the figures are from.
       unit: what was repeated.
     """
 
@@ -45,12 +45,12 @@ class Evidence(NamedTuple):
 
     @property
     def has_origin(self) -> bool:
-        """Whether commit and date are known of all."""
+        """Whether commit and date are known of all sources."""
         return bool(self.sources) and all(one.has_origin for one in self.sources)
 
     @property
     def is_enough(self) -> bool:
-        """Whether a reader can believe it: commit, date and `LEAST` runs."""
+        """Whether it has commit, date and at least `LEAST` runs."""
         return self.has_origin and self.repeats >= LEAST
 
     def __str__(self) -> str:
@@ -63,24 +63,24 @@ class Ratio(float):
     """A ratio of two figures.
 
     Attributes:
-      evidence: of both.
+      evidence: of both figures together.
     """
 
     evidence: Evidence
 
     def __new__(cls, value: float, evidence: Evidence) -> Ratio:
-        """A float that knows what it is of."""
+        """A float that keeps its evidence."""
         made = super().__new__(cls, value)
         made.evidence = evidence
         return made
 
 
-class Said(NamedTuple):
-    """Words about figures.
+class FigureText(NamedTuple):
+    """The text of one or several figures, as a table of words shows it.
 
     Attributes:
-      text: the words.
-      evidence: of the figures; None if there are none.
+      text: as written.
+      evidence: of the figures in the text; None if there are none.
     """
 
     text: str
@@ -97,7 +97,7 @@ def source(file: str, call: Call) -> Source:
 
 
 def together(parts: Iterable[Evidence]) -> Evidence | None:
-    """Of several figures: the fewest runs, and all files. None of none."""
+    """The evidence of several figures: the fewest runs, and all files. None if there are none."""
     found = list(parts)
     if not found:
         return None

@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from benchmarks.evaluation.evidence import Evidence, Ratio, Said, Source, source, together
+from benchmarks.evaluation.evidence import Evidence, FigureText, Ratio, Source, source, together
 from benchmarks.records import RESULTS, Call, read_calls
 from gmijax.errors import ConfigError
 
@@ -36,7 +36,7 @@ class Figure(NamedTuple):
 
     @property
     def evidence(self) -> Evidence:
-        """What it is of."""
+        """The repeats and the calls behind it."""
         return Evidence(self.repeats, self.sources)
 
     def shown(self, form: str = ",.0f") -> str:
@@ -131,25 +131,25 @@ def bounds(values: Sequence[float | None], form: str = ".2f") -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def said(value: Figure | Ratio | None, form: str = ".2f") -> Said:
-    """`shown`, with what it is of."""
-    return Said(shown(value, form), value.evidence if value is not None else None)
+def text_of(value: Figure | Ratio | None, form: str = ".2f") -> FigureText:
+    """The text of a figure as `shown` writes it, with its evidence."""
+    return FigureText(shown(value, form), value.evidence if value is not None else None)
 
 
-def said_bounds(values: Sequence[Figure | Ratio | None], form: str = ".2f") -> Said:
-    """`bounds`, with what all of them are of."""
+def text_of_range(values: Sequence[Figure | Ratio | None], form: str = ".2f") -> FigureText:
+    """The text of several figures as `bounds` writes it, with the evidence of all of them."""
     found = [value for value in values if value is not None]
     medians = [value.median if isinstance(value, Figure) else value for value in found]
-    return Said(bounds(medians, form), together(value.evidence for value in found))
+    return FigureText(bounds(medians, form), together(value.evidence for value in found))
 
 
-def joined(between: str, parts: Iterable[Said]) -> Said:
-    """Several, with something between two of them; if none was measured, only that."""
+def joined_texts(between: str, parts: Iterable[FigureText]) -> FigureText:
+    """Several texts with `between` from one to the next; `not measured` once if none was."""
     found = list(parts)
     evidence = together(one.evidence for one in found if one.evidence)
     if evidence is None:
-        return Said(NOT_MEASURED, None)
-    return Said(between.join(one.text for one in found), evidence)
+        return FigureText(NOT_MEASURED, None)
+    return FigureText(between.join(one.text for one in found), evidence)
 
 
 def _count(results: Mapping[str, Any]) -> int:

@@ -1,4 +1,4 @@
-"""What a check of the documents finds."""
+"""One problem that a check of the documents finds."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ class Finding(NamedTuple):
 
     Attributes:
       file: the document.
-      line: in it.
-      text: what stands there.
-      said: what the file of results says.
+      line: its number in the document.
+      text: what is written there.
+      problem: what is wrong with it.
     """
 
     file: str
     line: int
     text: str
-    said: str
+    problem: str
 
     def __str__(self) -> str:
-        return f"{self.file}:{self.line}: {self.text!r}: {self.said}"
+        return f"{self.file}:{self.line}: {self.text!r}: {self.problem}"

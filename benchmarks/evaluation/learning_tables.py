@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from benchmarks.cases import REWARD, TASKS
-from benchmarks.evaluation.evidence import Ratio, Said
+from benchmarks.evaluation.evidence import FigureText, Ratio
 from benchmarks.evaluation.figures import (
     NOT_MEASURED,
     RATES,
@@ -16,9 +16,9 @@ from benchmarks.evaluation.figures import (
     over,
     rate,
     results_of,
-    said,
     shown,
     sources_of,
+    text_of,
 )
 from benchmarks.evaluation.seed_tables import of_algorithms
 from benchmarks.evaluation.writer import Calls, Rows, table, table_of_calls
@@ -86,9 +86,9 @@ def seconds_over_one_process(task: str) -> Ratio | None:
     return over(four, one)
 
 
-def said_of_reward(task: str) -> Said:
+def text_of_reward(task: str) -> FigureText:
     """`seconds_over_one_process`, with how many runs of four GMIs got there, if not all."""
-    ratio, mark = said(seconds_over_one_process(task)), _mark(task)
+    ratio, mark = text_of(seconds_over_one_process(task)), _mark(task)
     share = "" if mark is None else _if_not_all(mark, *_gmis(task)[1])
     return ratio._replace(text=ratio.text + share)
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
-from benchmarks.evaluation.evidence import Evidence, Ratio, Said, source
-from benchmarks.evaluation.figures import TRAINING, Figure, figure, over, said_bounds, shown
+from benchmarks.evaluation.evidence import Evidence, FigureText, Ratio, source
+from benchmarks.evaluation.figures import TRAINING, Figure, figure, over, shown, text_of_range
 from benchmarks.evaluation.writer import Calls, Rows, table_of_calls
 from benchmarks.records import calls_by_date
 
@@ -113,7 +113,7 @@ def nodes(calls: Calls) -> Rows:
         yield from _rows(job, _by_job(call.results)[job])
 
 
-def two_nodes_over_one() -> dict[str, Said]:
+def two_nodes_over_one() -> dict[str, FigureText]:
     """Steps/s of two nodes over those of one, by a key of `TWO_NODES`."""
     found: dict[str, list[Ratio | None]] = {}
     for job, (call, path) in _newest().items():
@@ -122,4 +122,4 @@ def two_nodes_over_one() -> dict[str, Said]:
             if (gain := over_one_node(ways, way)) is not None:
                 of = Evidence(gain.evidence.repeats, sources)
                 found.setdefault(way, []).append(Ratio(gain, of))
-    return {key: said_bounds(found.get(way, ())) for key, way in TWO_NODES.items()}
+    return {key: text_of_range(found.get(way, ())) for key, way in TWO_NODES.items()}

@@ -7,16 +7,16 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from benchmarks.evaluation.evidence import Evidence, Ratio, Said, source
+from benchmarks.evaluation.evidence import Evidence, FigureText, Ratio, source
 from benchmarks.evaluation.figures import (
     NOT_MEASURED,
     Figure,
     bounds,
     figure,
     results_of,
-    said_bounds,
     shown,
     sources_of,
+    text_of_range,
 )
 from benchmarks.evaluation.writer import (
     Calls,
@@ -36,18 +36,18 @@ def _searches() -> Calls:
     return found
 
 
-def searched() -> Said:
+def text_of_searches() -> FigureText:
     """What the searches on one GPU chose, each once, and how long they took."""
     sources = frozenset(source(path.stem, call) for call, path in _searches().values())
     rows = answers()
     if not rows:
-        return Said(NOT_MEASURED, None)
+        return FigureText(NOT_MEASURED, None)
     chosen = (
         f"`{task}` {best['gmis_per_gpu']} x {best['num_envs']:,} ({best['impl']})"
         for task, best in ((task, row["best"]) for task, row in rows.items())
     )
     seconds = bounds([row["wall_s"] for row in rows.values()], ".0f")
-    return Said(f"{', '.join(chosen)}; {seconds} s", Evidence(1, sources))
+    return FigureText(f"{', '.join(chosen)}; {seconds} s", Evidence(1, sources))
 
 
 def answers() -> dict[str, Mapping[str, Any]]:
@@ -110,7 +110,7 @@ def read_layout(text: str) -> str:
     return f"{len(gpus)} x {gpus[0].count(',') + 1}"
 
 
-def model_fit() -> Said:
+def model_fit() -> FigureText:
     """Measured over predicted time of all reductions of the paper's strategies, in one call."""
     fits = [
         Ratio(
@@ -121,7 +121,7 @@ def model_fit() -> Said:
         for row in call.results["rows"]
         if row["predicted_s"]
     ]
-    return said_bounds(fits, ".3g")
+    return text_of_range(fits, ".3g")
 
 
 FAULTS = MappingProxyType(

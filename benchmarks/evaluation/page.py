@@ -1,6 +1,6 @@
-"""What the measurements add up to: the advice, and the figures of the front page.
+"""The tables that sum up the measurements: the advice, and the figures of the front page.
 
-Their words are in `advice.md` and `front.md`. Importing this registers every table.
+Their text is in `advice.md` and `front.md`. Importing this registers every table.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from benchmarks.evaluation.async_tables import (
     beside_a_learner,
     learners_over_one,
 )
-from benchmarks.evaluation.evidence import Ratio, Said
-from benchmarks.evaluation.figures import TRAINING, Figure, said, said_bounds
+from benchmarks.evaluation.evidence import FigureText, Ratio
+from benchmarks.evaluation.figures import TRAINING, Figure, text_of, text_of_range
 from benchmarks.evaluation.learning_tables import seconds_to_mark
 from benchmarks.evaluation.other_tables import seconds_to_recover
 from benchmarks.evaluation.pack_tables import CLEANRL, MJLAB, eight_packed
@@ -26,9 +26,9 @@ from benchmarks.evaluation.sweep_tables import KEYS as KEYS_OF_SWEEPS
 from benchmarks.evaluation.sweep_tables import eight_at_once, processes_over_program
 from benchmarks.evaluation.tables import best_plan_ratios, fixed_total_ratios, over_one_gpu
 from benchmarks.evaluation.walking_tables import seconds_until_it_walks
-from benchmarks.evaluation.writer import SAID, TABLES, Values, words
+from benchmarks.evaluation.writer import TABLES, WORD_TABLES, Values, word_table
 
-__all__ = ["SAID", "TABLES"]
+__all__ = ["TABLES", "WORD_TABLES"]
 
 
 STEPS, FINISHED = "steps", "finished"
@@ -61,36 +61,36 @@ def gains() -> dict[str, Gains]:
     }
 
 
-@words("advice")
+@word_table("advice")
 def advice() -> Values:
     """Who gains from GMIs, and who does not."""
     return {
         name: {
-            key: said(found[0]) if len(found) == 1 else said_bounds(found)
+            key: text_of(found[0]) if len(found) == 1 else text_of_range(found)
             for key, found in of_row.items()
         }
         for name, of_row in gains().items()
     }
 
 
-@words("front")
+@word_table("front")
 def front() -> Values:
     """What was measured, each with a link to the section that has its file."""
     go1, go1_seeds = seconds_until_it_walks("go1", "warp")
     beside = [one for one in over_brax() if one.evidence.is_enough]
     return {
-        "ant": said(_brief(seconds_to_mark("ant")), ".1f"),
-        "go1": said(_brief(go1), ".0f"),
-        "go1_seeds": Said(go1_seeds, None),
-        "eight": said(eight_at_once(KEYS_OF_SWEEPS[STEPS])),
-        "mjlab": {key: said(gain) for key, gain in eight_packed(MJLAB).items()},
-        "cleanrl": {key: said(gain) for key, gain in eight_packed(CLEANRL).items()},
-        "over_brax": said_bounds(beside),
-        "comparisons": Said(str(len(beside)), None),
-        "kill": said(_brief(seconds_to_recover().get("kill"), "kill"), ".0f"),
+        "ant": text_of(_brief(seconds_to_mark("ant")), ".1f"),
+        "go1": text_of(_brief(go1), ".0f"),
+        "go1_seeds": FigureText(go1_seeds, None),
+        "eight": text_of(eight_at_once(KEYS_OF_SWEEPS[STEPS])),
+        "mjlab": {key: text_of(gain) for key, gain in eight_packed(MJLAB).items()},
+        "cleanrl": {key: text_of(gain) for key, gain in eight_packed(CLEANRL).items()},
+        "over_brax": text_of_range(beside),
+        "comparisons": FigureText(str(len(beside)), None),
+        "kill": text_of(_brief(seconds_to_recover().get("kill"), "kill"), ".0f"),
     }
 
 
 def _brief(found: Figure | None, unit: str = "run") -> Ratio | None:
-    """Only its median; how many runs, or what `unit` says, it is of stands beside it."""
+    """Its median alone; the text beside it states how many runs, or other `unit`s, it is from."""
     return found and Ratio(found.median, found.evidence._replace(unit=unit))

@@ -1,7 +1,7 @@
 """Refuses files without a commit, and figures of few runs that `benchmarks/plan.md` does not name.
 
-On the front page no figure of few runs may stand. The plan has a table of files that have one or
-two runs of what a row says.
+The front page may have no figure of few runs. The plan has a table of the files with one or
+two runs of the figures in a row.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from benchmarks.evaluation.evidence import LEAST, Evidence
 from benchmarks.evaluation.finding import Finding
-from benchmarks.evaluation.page import SAID
+from benchmarks.evaluation.page import WORD_TABLES
 from benchmarks.records import RESULTS, read_calls
 
 PLAN = Path(__file__).parents[1] / "plan.md"
@@ -21,8 +21,8 @@ SELDOM = f"| files with fewer than {LEAST} runs |"
 STRICT = "front"
 """The table of the front page."""
 
-Words = Mapping[str, Callable[[], list[tuple[str, Evidence | None]]]]
-"""Tables of words: their lines, with what their figures are of."""
+WordTables = Mapping[str, Callable[[], list[tuple[str, Evidence | None]]]]
+"""Name of a table of words -> its lines, each with the evidence of its figures."""
 
 
 def without_commit(results: Path = RESULTS) -> Iterator[Finding]:
@@ -32,11 +32,11 @@ def without_commit(results: Path = RESULTS) -> Iterator[Finding]:
             yield Finding(path.name, 1, path.stem, "has a call without a commit")
 
 
-def unplanned(said: Words = SAID, plan: Path = PLAN) -> Iterator[Finding]:
+def unplanned(tables: WordTables = WORD_TABLES, plan: Path = PLAN) -> Iterator[Finding]:
     """Rows of few runs that the plan does not name, and files that it names without need."""
     seldom = _planned(plan.read_text())
     needed: set[str] = set()
-    for table, rows in said.items():
+    for table, rows in tables.items():
         for number, (line, evidence) in enumerate(rows(), 1):
             if evidence is None or evidence.is_enough:
                 continue
@@ -54,7 +54,7 @@ def unplanned(said: Words = SAID, plan: Path = PLAN) -> Iterator[Finding]:
 
 
 def _planned(text: str) -> dict[str, int]:
-    """Names of files in the first column of the table, and the lines where they stand."""
+    """Names of files in the first column of the table, and the numbers of their lines."""
     if (found := re.search(f"^{re.escape(SELDOM)}", text, re.MULTILINE)) is None:
         return {}
     begin, end = found.start(), text.find("\n## ", found.start())

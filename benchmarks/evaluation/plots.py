@@ -1,4 +1,4 @@
-"""The pictures of the evaluation, as SVG; each keeps its numbers, so a stale one can be told."""
+"""The pictures of the evaluation, as SVG; each keeps its numbers, so a stale one can be found."""
 
 from __future__ import annotations
 

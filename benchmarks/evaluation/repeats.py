@@ -1,8 +1,8 @@
-"""Refuses a marked figure of which a page says more runs than its file has.
+"""Refuses a marked figure for which a page claims more runs than its file has.
 
-What a page says of a figure stands in its line: `n=3`, "three runs", "ran once"; for a figure in a
-table, in a column of runs, else also in the paragraph above the table. A page that says nothing
-stands for `LEAST` runs, so a figure of fewer has to say so.
+A page claims runs in the line of the figure: `n=3`, "three runs", "ran once"; for a figure in a
+table, in a column of runs, else also in the paragraph above the table. A figure without a claim
+counts as one of `LEAST` runs, so the page has to write it down if there are fewer.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ _RUNS = re.compile(
 _COLUMN = re.compile(r"\bruns\b")
 
 
-def runs_said(name: str, text: str, marked: re.Pattern[str]) -> Iterator[Finding]:
-    """Marked figures of a document that have fewer runs than it says."""
+def overstated_runs(name: str, text: str, marked: re.Pattern[str]) -> Iterator[Finding]:
+    """Marked figures of a document that have fewer runs than it claims."""
     for match in marked.finditer(text):
         try:
             runs = min(map(len, look_up_all(match[2])[1]))
         except ConfigError:
-            continue  # Another check says so.
+            continue  # Another check reports it.
         at = text.count("\n", 0, match.start())
-        said = min(_said(text.split("\n"), at, marked), default=LEAST)
-        if said > runs:
+        claimed = min(_claimed_runs(text.split("\n"), at, marked), default=LEAST)
+        if claimed > runs:
             have = f"{match[2].partition('.json')[0]}.json has {runs} of it"
-            yield Finding(name, at + 1, match[4], f"stands for {said} runs, and {have}")
+            yield Finding(name, at + 1, match[4], f"stands for {claimed} runs, and {have}")
 
 
-def _said(lines: list[str], at: int, marked: re.Pattern[str]) -> Iterator[int]:
-    """Numbers of runs that a document says beside a figure in one of its lines."""
+def _claimed_runs(lines: list[str], at: int, marked: re.Pattern[str]) -> Iterator[int]:
+    """Numbers of runs that a document claims beside a figure in one of its lines."""
     line, above = lines[at], lines[:at]
     if line.startswith("|"):
         table = [at for at, one in enumerate(above) if not one.startswith("|")]

@@ -7,24 +7,24 @@ from pathlib import Path
 from string import Formatter
 from typing import Any, TypeAlias, TypeVar
 
-from benchmarks.evaluation.evidence import Evidence, Said, together
+from benchmarks.evaluation.evidence import Evidence, FigureText, together
 from benchmarks.evaluation.figures import NOT_MEASURED, call_of, repeats_of
 from benchmarks.records import Call, calls_by_date
 
 Rows: TypeAlias = Iterable[Sequence[str]]
 Calls: TypeAlias = Mapping[Any, tuple[Call, Path]]
-"""The calls that a table is of, with their files, by what tells them apart."""
+"""The calls that a table shows, with their files, by a key that differs from call to call."""
 MakeRows = TypeVar("MakeRows", bound=Callable[[], Rows])
 MakeRowsOfCalls = TypeVar("MakeRowsOfCalls", bound=Callable[[Calls], Rows])
 MakeLines = TypeVar("MakeLines", bound=Callable[[], list[str]])
-Values: TypeAlias = Mapping[str, Said | Mapping[str, Said]]
+Values: TypeAlias = Mapping[str, FigureText | Mapping[str, FigureText]]
 MakeValues = TypeVar("MakeValues", bound=Callable[[], Values])
 
 TABLES: dict[str, Callable[[], list[str]]] = {}
 """By the name that documents use: `<!-- table: NAME -->`."""
 
-SAID: dict[str, Callable[[], list[tuple[str, Evidence | None]]]] = {}
-"""Of tables of words: every line, with what its figures are of."""
+WORD_TABLES: dict[str, Callable[[], list[tuple[str, Evidence | None]]]] = {}
+"""By the same name, for tables made from a text file: every line, with its figures' evidence."""
 
 
 def table(
@@ -36,7 +36,7 @@ def table(
       name: in documents.
       head: see `markdown`.
       files: of results that its figures are from.
-      more: such files, where results say which.
+      more: further files, found when the table is made.
     """
 
     def make(rows: MakeRows) -> list[str]:
@@ -66,8 +66,8 @@ def table_of_calls(
       name: in documents.
       head: see `markdown`.
       find: the calls.
-      note: what is said of a call beside its file, by its key.
-      is_brief: calls of which nothing else is said stand once.
+      note: a remark on a call beside its file, by its key.
+      is_brief: whether equal lines below the table are written once.
     """
 
     def register(rows: MakeRowsOfCalls) -> MakeRowsOfCalls:
@@ -108,38 +108,38 @@ def lines(name: str) -> Callable[[MakeLines], MakeLines]:
     return register
 
 
-def words(name: str) -> Callable[[MakeValues], MakeValues]:
-    """Registers a function of the figures in `<name>.md` as a table."""
+def word_table(name: str) -> Callable[[MakeValues], MakeValues]:
+    """Registers the figures that a function returns, filled into `<name>.md`, as a table."""
 
     def register(make: MakeValues) -> MakeValues:
         template = Path(__file__).parent / f"{name}.md"
 
-        def said() -> list[tuple[str, Evidence | None]]:
+        def filled_lines() -> list[tuple[str, Evidence | None]]:
             values = make()
             return [_filled(line, values) for line in template.read_text().splitlines()]
 
-        SAID[name] = said
-        TABLES[name] = lambda: [line for line, _ in SAID[name]()]
+        WORD_TABLES[name] = filled_lines
+        TABLES[name] = lambda: [line for line, _ in WORD_TABLES[name]()]
         return make
 
     return register
 
 
 def _filled(line: str, values: Values) -> tuple[str, Evidence | None]:
-    """A line with figures in the places of their names; `{on}` is what they are of."""
+    """A line with figures in the places of their names; `{on}` is their evidence."""
     evidence = together(one.evidence for one in _named(line, values) if one.evidence)
     cells = (_filled_cell(cell, {**values, "on": evidence or ""}) for cell in line.split("|"))
     return "|".join(cells), evidence
 
 
 def _filled_cell(cell: str, values: Mapping[str, Any]) -> str:
-    """A cell whose figures are all missing says so once."""
+    """A filled cell; `not measured` once if all its figures are missing."""
     found = _named(cell, values)
     is_missing = found and all(one.text == NOT_MEASURED for one in found)
     return f" {NOT_MEASURED} " if is_missing else cell.format(**values)
 
 
-def _named(text: str, values: Mapping[str, Any]) -> list[Said]:
+def _named(text: str, values: Mapping[str, Any]) -> list[FigureText]:
     """The figures that a text names, but for `{on}`."""
     names = (name for _, name, *_ in Formatter().parse(text) if name and name != "on")
     return [Formatter().get_field(name, (), values)[0] for name in names]
@@ -168,7 +168,7 @@ def line_of(file: str, call: Call | None, note: str = "") -> str:
 
 
 def origin(call: Call) -> str:
-    """Commit, date, device, driver and repeats of a call; `unknown` where the file is silent."""
+    """Commit, date, device, driver and repeats of a call; `unknown` where the file has none."""
     commits = [one[:10] for one in (call.commit or "unknown").split(", ")]
     parts = [f"commit {', '.join(commits)}" + (" with changes" if call.is_dirty else "")]
     parts.append(call.date[:10] if call.date else "date unknown")

@@ -65,7 +65,9 @@ class Benchmark:
         self.file = results_file(given, "peers")
         self._runs: dict[Side, list[dict[str, Any]]] = {side: [] for side in sides}
         self.file.results["cases"] = {
-            str(side): {"told": side.told, "runs": runs} for side, runs in self._runs.items()
+            # The key of the settings as in the calls that are already in the file.
+            str(side): {"told": side.settings, "runs": runs}
+            for side, runs in self._runs.items()
         }
 
     @property
@@ -74,7 +76,7 @@ class Benchmark:
         return any("failed" in run for runs in self._runs.values() for run in runs)
 
     def run(self) -> None:
-        """Compiles, then runs every side as often as wanted, all once before one comes twice."""
+        """Compiles, then runs every side as often as wanted, each once before any is repeated."""
         at_once = max(1, (os.cpu_count() or 1) // 2)
         for first in range(0, len(self._sides), at_once):
             self._compile(self._sides[first : first + at_once])
@@ -157,7 +159,7 @@ def wanted_sides(
 ) -> Iterator[Side]:
     """Both sides of the comparisons with one of `only` in the name, of those to be had here.
 
-    `places` says of peers that are not packages of this environment where they are, see `Side`.
+    `places` has the path of each peer that is not a package of this environment, see `Side`.
 
     Raises:
       ConfigError: no comparison has that in its name, or an override is wrong.
@@ -175,7 +177,7 @@ def wanted_sides(
             sys.stderr.write(f"{name}: left out, give {_PLACES[peer]}\n")
             continue
         for side in (Side(name, trainer, more, places.get(peer, "")) for trainer in (OURS, peer)):
-            _ = side.told  # Composes it, so that a wrong override is found now.
+            _ = side.settings  # Composes them, so that a wrong override is found now.
             yield side
 
 

@@ -1,7 +1,7 @@
 """A run by Brax's PPO in a process of its own: `python -m benchmarks.peers.brax_ppo IN OUT`.
 
 IN is a JSON file with a `BraxTraining`; OUT gets the curve, seconds since the start and
-environment steps by then, and mean returns of the latest episodes, if it is told to log them.
+environment steps by then, and mean returns of the latest episodes, if the arguments ask for them.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def train(training: BraxTraining, progress: Any) -> None:
 
 
 def environment(training: BraxTraining) -> tuple[Any, dict[str, Any]]:
-    """The environment without wrappers, and what `train` must be told because of it."""
+    """The environment without wrappers, and the arguments of `train` that depend on it."""
     length = training.arguments["episode_length"]
     if training.suite == "gmijax":
         # Environments of MJX-Warp share buffers that are made for so many.

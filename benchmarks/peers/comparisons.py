@@ -1,4 +1,4 @@
-"""The runs that are compared, as data: what both sides are told is made from one tuple."""
+"""The runs that are compared, as data: the settings of both sides are made from one tuple."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OURS, BRAX, MJLAB, FAST_TD3 = "gmijax", "Brax", "mjlab", "FastTD3"
 MJLAB_TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
 
 REPORTS = 10
-"""How often a trainer of Brax tells how far it is. Between two reports it runs by itself."""
+"""How often a trainer of Brax reports its progress. Between two reports it runs by itself."""
 
 
 class Comparison(NamedTuple):
@@ -26,7 +26,7 @@ class Comparison(NamedTuple):
     and FastTD3 one of Playground's.
 
     Attributes:
-      overrides: of `gmijax.train`. What the other is told is made from the same.
+      overrides: of `gmijax.train`. The settings of the other are made from the same.
       unrolls: Brax cuts the T steps of an iteration into so many unrolls. What an iteration
         collects, a minibatch has and an epoch goes over is the same; advantages look less far.
       peer: the other, `Brax`, `mjlab` or `FastTD3`.
@@ -126,12 +126,12 @@ COMPARISONS: Mapping[str, Comparison] = MappingProxyType(
 
 
 def case_name(comparison: str, trainer: str) -> str:
-    """Under which the runs of one side stand."""
+    """The key of one side's runs in the file of results."""
     return f"{comparison}, {trainer}"
 
 
 class BraxTraining(NamedTuple):
-    """What `benchmarks.peers.brax_ppo` is told.
+    """Settings for `benchmarks.peers.brax_ppo`.
 
     Attributes:
       suite: of the comparison.
@@ -235,7 +235,7 @@ def _learning_rate(algo: PpoConfig) -> dict[str, Any]:
 def mjlab_training(
     comparison: Comparison, more: tuple[str, ...] = (), *, seed: int = 0
 ) -> dict[str, Any]:
-    """What `benchmarks.peers.mjlab_ppo` is told: as many environments and steps, its own rest."""
+    """Settings for `benchmarks.peers.mjlab_ppo`: as many environments and steps, its own rest."""
     config: TrainConfig = compose(*comparison.overrides, *more)
     iteration = config.envs_per_gmi * config.algo.unroll_length
     return {

@@ -61,15 +61,15 @@ class Curve:
 
 def main() -> int:
     """Trains, and writes the curve."""
-    told = json.loads(Path(sys.argv[1]).read_text())
-    out, folder = Path(sys.argv[2]).absolute(), Path(told["checkout"]).absolute() / "fast_td3"
+    settings = json.loads(Path(sys.argv[1]).read_text())
+    out, folder = Path(sys.argv[2]).absolute(), Path(settings["checkout"]).absolute() / "fast_td3"
     has_gpu = importlib.import_module("torch").cuda.is_available()
-    flags = {**told["flags"], "cuda": has_gpu}
+    flags = {**settings["flags"], "cuda": has_gpu}
     curve = Curve(flags["num-envs"], flags["total-timesteps"])
     sys.modules["wandb"] = ModuleType("wandb")
     sys.path.insert(0, str(folder))
     os.chdir(out.parent)  # It writes the policy into `models`.
-    patch_environments(told["impl"], curve, has_gpu=has_gpu)
+    patch_environments(settings["impl"], curve, has_gpu=has_gpu)
     sys.argv = ["train.py", *words(flags)]
     runpy.run_path(str(folder / "train.py"), run_name="__main__")
     out.write_text(json.dumps({"curve": curve.points, "returns": curve.returns}))
@@ -77,7 +77,7 @@ def main() -> int:
 
 
 def words(flags: dict[str, Any]) -> list[str]:
-    """Of a command line, from the values of flags by their names."""
+    """The words of a command line, from the values of flags by their names."""
     made = []
     for name, value in flags.items():
         if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""What FastTD3 is told, made from what our SAC is told."""
+"""The settings of FastTD3, made from those of our SAC."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gmijax.sim.robots import playground_name
 def fast_td3_training(
     comparison: Comparison, more: tuple[str, ...] = (), *, seed: int = 0
 ) -> dict[str, Any]:
-    """What `benchmarks.peers.fast_td3` is told but for its `checkout`; the rest is FastTD3's own.
+    """Settings for `benchmarks.peers.fast_td3` without `checkout`; the rest is FastTD3's own.
 
     As much work: environments, steps, updates, transitions in one, layers as wide, atoms, and a
     replay as large. It is TD3, without layer norm, and with its own rates, noise and range of

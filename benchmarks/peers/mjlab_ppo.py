@@ -19,9 +19,9 @@ from typing import Any
 def main() -> int:
     """Trains, and writes the curve."""
     started_s = time.monotonic()
-    told = json.loads(Path(sys.argv[1]).read_text())
-    runner = make_runner(told["task"], told["num_envs"], told["seed"])
-    steps = told["num_envs"] * runner.cfg["num_steps_per_env"]
+    settings = json.loads(Path(sys.argv[1]).read_text())
+    runner = make_runner(settings["task"], settings["num_envs"], settings["seed"])
+    steps = settings["num_envs"] * runner.cfg["num_steps_per_env"]
     curve: list[tuple[float, int]] = []
     update = runner.alg.update
 
@@ -31,7 +31,7 @@ def main() -> int:
         return losses
 
     runner.alg.update = timed_update
-    runner.learn(told["iterations"], init_at_random_ep_len=True)
+    runner.learn(settings["iterations"], init_at_random_ep_len=True)
     Path(sys.argv[2]).write_text(json.dumps({"curve": curve}))
     return 0
 

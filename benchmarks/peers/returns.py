@@ -19,8 +19,8 @@ from benchmarks.runner import Command, deadline, exit_code, failures_of, options
 from gmijax.runs.folder import read_json, write_json
 
 
-def told(task: str, more: tuple[str, ...], seed: int) -> dict[str, Any]:
-    """What the process of a run is told.
+def settings_of(task: str, more: tuple[str, ...], seed: int) -> dict[str, Any]:
+    """Settings for the process of a run.
 
     Args:
       task: of Playground.
@@ -30,8 +30,8 @@ def told(task: str, more: tuple[str, ...], seed: int) -> dict[str, Any]:
     Raises:
       ConfigError: see `brax_training`.
     """
-    settings = ("env=playground", f"env.name={task}", "tuned=dm_control_ppo", "physics.impl=warp")
-    training = brax_training(Comparison(settings, unrolls=16), more, seed=seed)
+    overrides = ("env=playground", f"env.name={task}", "tuned=dm_control_ppo", "physics.impl=warp")
+    training = brax_training(Comparison(overrides, unrolls=16), more, seed=seed)
     return training._replace(
         arguments={**training.arguments, "log_training_metrics": True}
     )._asdict()
@@ -66,7 +66,8 @@ def main() -> int:
     parser.add_argument("--timeout-s", type=float, default=3600.0)
     given = parser.parse_args()
     names = {f"{task}-{seed}": (task, seed) for task in given.tasks for seed in range(given.seeds)}
-    tasks = {name: told(task, tuple(given.override), seed) for name, (task, seed) in names.items()}
+    more = tuple(given.override)
+    tasks = {name: settings_of(task, more, seed) for name, (task, seed) in names.items()}
     file = results_file(given, "brax-returns")
     with tempfile.TemporaryDirectory() as scratch:
         found = train(tasks, Path(scratch), given.timeout_s)

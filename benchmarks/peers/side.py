@@ -33,7 +33,7 @@ _SCRIPT_FLAGS: Mapping[str, str] = {
     "brax": "--xla_gpu_graph_min_graph_size=1",
     "playground": "--xla_gpu_triton_gemm_any=True",
 }
-"""What Brax's and Playground's training scripts tell XLA; Brax's too where the task is ours."""
+"""Flags of XLA that Brax's and Playground's training scripts set; Brax's too for tasks of ours."""
 
 _OF_FAST_TD3: Mapping[str, str] = {
     "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
@@ -65,8 +65,8 @@ class Side(NamedTuple):
         return case_name(self.comparison, self.trainer)
 
     @property
-    def told(self) -> Any:
-        """What tells the whole training: the command of ours, the arguments of the other's."""
+    def settings(self) -> Any:
+        """All settings of the training: our command, or the arguments of the other library."""
         if self.trainer == OURS:
             return shlex.join(["python", "-m", "gmijax.train", *self._overrides])
         return self._training(seed=0)
@@ -107,11 +107,11 @@ class Side(NamedTuple):
         return [(seconds, steps) for seconds, steps in read_json(folder / "out.json")["curve"]]
 
     def returns(self, folder: Path) -> list[tuple[float, float]]:
-        """Seconds, as in `curve`, and mean return of the latest episodes; empty: not told."""
+        """Seconds, as in `curve`, and mean return of the latest episodes; empty: not recorded."""
         if self.trainer == OURS:
             lines = read_metrics(RunPaths(folder / "run").metrics)
-            told = [(line["wall_s"], line.get("return")) for line in lines]
-            return [(seconds, one) for seconds, one in told if one is not None]
+            points = [(line["wall_s"], line.get("return")) for line in lines]
+            return [(seconds, one) for seconds, one in points if one is not None]
         return read_json(folder / "out.json").get("returns", [])
 
     @property
@@ -120,19 +120,19 @@ class Side(NamedTuple):
         return (*COMPARISONS[self.comparison].overrides, *one, *self.more)
 
     def _train(self, folder: Path, *more: str) -> list[str]:
-        told = (*self._overrides, *more, f"run.dir={folder / 'run'}")
-        return [sys.executable, "-m", "gmijax.train", *told]
+        overrides = (*self._overrides, *more, f"run.dir={folder / 'run'}")
+        return [sys.executable, "-m", "gmijax.train", *overrides]
 
     def _training(self, *, seed: int, is_short: bool = False) -> dict[str, Any]:
-        """What the process of the other library is told."""
+        """Settings for the process of the other library."""
         comparison = COMPARISONS[self.comparison]
         if self.trainer == MJLAB:
-            told = mjlab_training(comparison, self.more, seed=seed)
-            return {**told, "iterations": 2} if is_short else told
+            settings = mjlab_training(comparison, self.more, seed=seed)
+            return {**settings, "iterations": 2} if is_short else settings
         if self.trainer == FAST_TD3:
             more = (*self.more, "num_timesteps=1") if is_short else self.more
-            told = fast_td3_training(comparison, more, seed=seed)
-            return {**told, "checkout": self.where}
+            settings = fast_td3_training(comparison, more, seed=seed)
+            return {**settings, "checkout": self.where}
         reports = _WARM_REPORTS if is_short else REPORTS
         return brax_training(comparison, self.more, reports=reports, seed=seed)._asdict()
 

@@ -131,7 +131,7 @@ def test_a_message_that_never_fits_is_refused(way: Way) -> None:
         way.writer.try_reserve([largest])
 
 
-def test_what_was_sent_before_the_end_arrives_and_then_the_end_is_said(way: Way) -> None:
+def test_what_was_sent_before_the_end_arrives_and_then_the_end(way: Way) -> None:
     way.send(b"first")
     way.send(b"last")
     closing_end = threading.Thread(target=way.writer.close)
@@ -182,7 +182,7 @@ def test_nothing_is_lost_doubled_torn_or_out_of_order(
 def test_the_trainer_with_less_to_do_gets_more(transport: str, tmp_path: Path) -> None:
     topology = ChannelTopology(agents=(0,), trainers=(1, 2), gpu_of=(0, 1, 2))
     task = {"count": 20_000, "envs": 100, "batch": 100, "sizes": (50, 2), "pause_chance": 1.0}
-    # Room for all of it, so that only the load can tell.
+    # Room for all of it, so that only the load decides.
     settings = config(capacity_mib=32)
     with ChannelJob(tmp_path, settings, topology, TRANSPORTS[transport], **task) as job:
         job.start(1, busy_s=0.1).start(2).wait_for("open")
@@ -193,7 +193,7 @@ def test_the_trainer_with_less_to_do_gets_more(transport: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
-def test_an_agent_that_finds_no_room_waits_as_told(transport: str, tmp_path: Path) -> None:
+def test_an_agent_that_finds_no_room_waits_as_configured(transport: str, tmp_path: Path) -> None:
     topology = ChannelTopology(agents=(0,), trainers=(1,), gpu_of=(0, 0))
     task = {"count": 10**6, "envs": 100, "batch": 100, "sizes": (50, 2), "timeout_s": 1.0}
     with ChannelJob(tmp_path, config(), topology, TRANSPORTS[transport], **task) as job:
@@ -201,7 +201,7 @@ def test_an_agent_that_finds_no_room_waits_as_told(transport: str, tmp_path: Pat
         job.signal(1, signal.SIGSTOP)
         job.start(0)
         result = job.result(0)
-        # `send` said False; the process of the test makes an error of it.
+        # `send` returned False; the process of the test makes an error of it.
         assert (result["error"], result["peers"]) == ("CollectiveTimeout", [1])
 
 

@@ -80,14 +80,14 @@ def test_device_memory_that_does_not_work_is_found_by_all(
     }
     with Ranks(tmp_path, 2, "check_means", **options).start() as job:
         results = job.results()
-    said = "shared GPU memory does not hold what was written into it"
+    message = "shared GPU memory does not hold what was written into it"
     for rank, result in enumerate(results):
         if instead is not None:
             assert result["error"] is None
-            assert f"{said}; so {instead}" in (tmp_path / f"stderr_{rank}").read_text()
+            assert f"{message}; so {instead}" in (tmp_path / f"stderr_{rank}").read_text()
         else:
             assert result["error"] == "DeviceMemoryUnavailable"
-            assert result["message"].endswith(said)
+            assert result["message"].endswith(message)
 
 
 def test_device_memory_that_one_node_lacks_is_used_by_none(tmp_path: Path) -> None:
@@ -98,8 +98,8 @@ def test_device_memory_that_one_node_lacks_is_used_by_none(tmp_path: Path) -> No
     assert len({result["digest"] for result in results}) == 1
     for rank, result in enumerate(results):
         assert result["error"] is None, result
-        said = "what was written into it; so reduce.strategy=mpr through host memory"
-        assert said in (tmp_path / f"stderr_{rank}").read_text()
+        message = "what was written into it; so reduce.strategy=mpr through host memory"
+        assert message in (tmp_path / f"stderr_{rank}").read_text()
 
 
 @pytest.mark.parametrize("case", RINGS_OVER_NODES, ids=str)
@@ -151,25 +151,25 @@ def test_what_some_ranks_lack_for_rings_over_nodes_is_used_by_none(
     assert len({result["digest"] for result in results}) == 1
     for rank, result in enumerate(results):
         assert result["error"] is None, result
-        said = (tmp_path / f"stderr_{rank}").read_text()
-        assert all(way in said for way in ways), said
+        stderr = (tmp_path / f"stderr_{rank}").read_text()
+        assert all(way in stderr for way in ways), stderr
 
 
 @pytest.mark.parametrize(
-    ("special", "said"),
+    ("special", "message"),
     [
         ("without_network", "rings between GPUs: ncclSystemError"),
         ("broken_network", "exchange on the device's stream: .*ncclRemoteError"),
     ],
 )
-def test_what_one_member_of_a_ring_lacks_is_said_while_the_others_wait_for_it(
-    special: str, said: str, tmp_path: Path
+def test_what_one_member_of_a_ring_lacks_is_reported_while_the_others_wait_for_it(
+    special: str, message: str, tmp_path: Path
 ) -> None:
     options = {"inter": "nccl", "layout": [[0], [1]], "num_nodes": 2, "num_calls": 2}
     options |= {"special_rank": 1, "special": special}
     with Ranks(tmp_path, 2, "check_means", strategy="flat", **options).start() as job:
         log = tmp_path / "stderr_1"
-        wait_until(lambda: re.search(said, log.read_text()), 60, "it says why it does not work")
+        wait_until(lambda: re.search(message, log.read_text()), 60, "it says why it does not work")
         assert not job.processes[0].ends_within(0.0)
         assert log.read_text().count(": RuntimeWarning: ") == 1
 
@@ -183,8 +183,8 @@ def test_a_device_that_takes_no_copies_leaves_exchanges_to_the_host(tmp_path: Pa
         results = job.results()
     for rank, result in enumerate(results):
         assert result["error"] is None, result
-        said = (tmp_path / f"stderr_{rank}").read_text()
-        assert "GMI 1: INTERNAL: gmijax_exchange_0: CUDA_ERROR_INVALID_VALUE; so" in said
+        stderr = (tmp_path / f"stderr_{rank}").read_text()
+        assert "GMI 1: INTERNAL: gmijax_exchange_0: CUDA_ERROR_INVALID_VALUE; so" in stderr
 
 
 def test_exchanges_in_different_orders_fail_and_do_not_mix(tmp_path: Path) -> None:

@@ -275,7 +275,7 @@ def test_models_and_randomisers_are_known_for_every_task() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (
             {"settings": {"noise_config.levl": 1.0}},
@@ -287,12 +287,14 @@ def test_models_and_randomisers_are_known_for_every_task() -> None:
         ({"rewards": {"torqes": 1.0}}, "^env.rewards.torqes: .* no such term: did you mean torq"),
     ],
 )
-def test_what_other_tasks_do_not_have_is_one_line(options: Any, said: str, models: None) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_what_other_tasks_do_not_have_is_one_line(
+    options: Any, message: str, models: None
+) -> None:
+    with pytest.raises(ConfigError, match=message):
         make_env("Go1JoystickFlatTerrain", suite="playground", **options)
 
 
-def test_a_model_that_is_missing_is_said_by_the_gmi_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_model_is_reported_by_the_gmi_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MENAGERIE_ROOT", "/nowhere")
     with pytest.raises(ConfigError, match=r"^MENAGERIE_ROOT=/nowhere has no model google_bark"):
         make_env("BarkourJoystick", suite="playground")

@@ -44,7 +44,7 @@ def run_case(case: Case, scratch: Path, fixtures: Path) -> Report:
             job.run_all()
         wrong = job.wrong
     except Exception as error:
-        text = "" if job is None else job.said()[-600:]
+        text = "" if job is None else job.stderr()[-600:]
         wrong = [f"{type(error).__name__}: {error} {text}"]
     send(processes_of(scratch), signal.SIGKILL)  # After an error: it may still run.
     return Report.of(case.kind, case.seed, wrong)
@@ -76,7 +76,7 @@ class FaultyCommand:
         """What it has finished."""
         return self._about.progress(self.run)
 
-    def said(self) -> str:
+    def stderr(self) -> str:
         """The errors of the last command."""
         path = self.scratch / f"stderr_{self._commands - 1}.txt"
         return path.read_text(errors="replace") if path.exists() else ""
@@ -139,11 +139,11 @@ class FaultyCommand:
     def _judge_end(self, job: subprocess.Popen[bytes]) -> None:
         code, wanted = self._wait(job), EXIT_CODES[self._kind.outcome]
         if code != wanted:
-            self.wrong.append(f"exit code {code}, not {wanted}: {self.said()[-600:]}")
+            self.wrong.append(f"exit code {code}, not {wanted}: {self.stderr()[-600:]}")
         if code != -9:
-            self.wrong += fault_checks.not_one_line(self.said(), self._about.verb)
-        if self._kind.says not in self.said():
-            self.wrong.append(f"{self._kind.says!r} is not in {self.said()[-600:]}")
+            self.wrong += fault_checks.not_one_line(self.stderr(), self._about.verb)
+        if self._kind.says not in self.stderr():
+            self.wrong.append(f"{self._kind.says!r} is not in {self.stderr()[-600:]}")
 
     def _end_well(self, job: subprocess.Popen[bytes], wanted: int) -> None:
         if self._about.is_endless:
@@ -156,9 +156,9 @@ class FaultyCommand:
             send([Process(job.pid, "controller")], signal.SIGTERM)
         code = self._wait(job)
         if code != (130 if self._about.is_endless else 0):
-            self.wrong.append(f"it must go on, but exit code {code}: {self.said()[-600:]}")
-        if "Traceback" in self.said():
-            self.wrong.append(f"a traceback: {self.said()[-600:]}")
+            self.wrong.append(f"it must go on, but exit code {code}: {self.stderr()[-600:]}")
+        if "Traceback" in self.stderr():
+            self.wrong.append(f"a traceback: {self.stderr()[-600:]}")
         if self.progress() < wanted:
             self.wrong.append(f"lost: {wanted} was there, and at the end {self.progress()}")
         if self._kind.does == "suspend":

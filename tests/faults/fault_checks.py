@@ -86,12 +86,12 @@ def events_of(run: Path, event: str | None = None) -> list[dict[str, Any]]:
     return [line for line in found if event is None or line.get("event") == event]
 
 
-def not_one_line(said: str, verb: str) -> list[str]:
+def not_one_line(stderr: str, verb: str) -> list[str]:
     """What is wrong with the errors of a command that failed: they are one line."""
-    lines = said.splitlines()
+    lines = stderr.splitlines()
     if len(lines) == 1 and lines[0].startswith(f"gmijax.{verb}: "):
         return []
-    return [f"not one line of gmijax.{verb}: {said[-600:]}"]
+    return [f"not one line of gmijax.{verb}: {stderr[-600:]}"]
 
 
 def what_is_wrong(run: Path) -> list[str]:

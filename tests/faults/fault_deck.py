@@ -145,8 +145,8 @@ _NAMES: Final[dict[str, OuterKind]] = {
 
 OUTER_KINDS: Final[dict[str, OuterKind]] = _PROCESSES | _FOLDERS | _DISKS | _NAMES
 EDIT_KINDS: Final = tuple(EDITS)
-STRANGER_KINDS: Final = ("strangers_meeting", "strangers_registers")
-ALL_KINDS: Final = (*KINDS, *OUTER_KINDS, *EDIT_KINDS, *STRANGER_KINDS)
+CLIENT_KINDS: Final = ("strangers_meeting", "strangers_registers")
+ALL_KINDS: Final = (*KINDS, *OUTER_KINDS, *EDIT_KINDS, *CLIENT_KINDS)
 
 
 def draw_trials(seed: int, num_faults: int, kinds: Sequence[str]) -> Iterator[Trial]:

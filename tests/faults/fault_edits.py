@@ -61,24 +61,24 @@ def _run(kind: EditKind, draw: random.Random, scratch: Path, fixtures: Path) -> 
     way = damage(file, kind, draw)
     before = {path: path.read_bytes() for path in run.rglob("*") if _is_plain(path)}
     newest = newest_whole(run)
-    code, said, shown = _read(kind, file, run, scratch)
+    code, stderr, shown = _read(kind, file, run, scratch)
     what = f"{file.relative_to(run)} damaged ({way}), {kind.reader}"
     if code is None:
         return [f"{what}: no end within {_LIMIT_S:.0f} s"]
     wrong = []
-    if kind.says not in said + shown:
-        wrong.append(f"{what}: {kind.says} is not in {said[-300:]} {shown[-300:]}")
+    if kind.says not in stderr + shown:
+        wrong.append(f"{what}: {kind.says} is not in {stderr[-300:]} {shown[-300:]}")
     if kind.holds and kind.holds not in file.read_text():
         wrong.append(f"{what}: {kind.holds} is not kept")
     if code not in ((0, 2) if kind.code is None else (kind.code,)):
-        wrong.append(f"{what}: exit code {code}: {said[-600:]}")
+        wrong.append(f"{what}: exit code {code}: {stderr[-600:]}")
     elif code == 2:
         verb = READERS[kind.reader][0]
-        wrong += [f"{what}: {text}" for text in not_one_line(said, verb)]
+        wrong += [f"{what}: {text}" for text in not_one_line(stderr, verb)]
         changed = [p for p, data in before.items() if not p.is_file() or p.read_bytes() != data]
         wrong += [f"lost: {what}: refused, but {path} is not as it was" for path in changed]
-    elif "Traceback" in said:
-        wrong.append(f"{what}: a traceback: {said[-600:]}")
+    elif "Traceback" in stderr:
+        wrong.append(f"{what}: a traceback: {stderr[-600:]}")
     if code == 0 and kind.reader in ("auto", "given", "resume"):
         wrong += _what_was_lost(run, scratch / "new", newest, kind)
     kept = (path.parent for path in before if path.name == "meta.json")

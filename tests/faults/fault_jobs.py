@@ -97,12 +97,12 @@ class _Job:
 
     def came(self) -> list[Came]:
         """All faults with their outcomes."""
-        fired, told = self._fired(), []
+        fired, found = self._fired(), []
         for number, fault in enumerate(self._faults):
             is_missing = number not in fired and KINDS[fault.kind].place != "command"
             outcome = "it did not come" if is_missing else "as wanted"
-            told.append(Came(fault.kind, fault.iteration, self.wrong.get(number, outcome)))
-        return told
+            found.append(Came(fault.kind, fault.iteration, self.wrong.get(number, outcome)))
+        return found
 
     def _give_command(self) -> bool:
         """Starts or resumes the job and waits for its end; returns whether it must be resumed."""
@@ -170,8 +170,8 @@ class _Job:
         # Nothing can be noted on a full disk.
         is_full = any(kind.does == "fill_disk" for kind in kinds.values())
         if code != wanted or (len(faults) != num_faults and not is_full):
-            said = (self._cwd / f"stderr_{self.commands - 1}.txt").read_text()[-600:]
-            text = f"unexpected: exit code {code}, {len(faults)} faults, {said}"
+            stderr = (self._cwd / f"stderr_{self.commands - 1}.txt").read_text()[-600:]
+            text = f"unexpected: exit code {code}, {len(faults)} faults, {stderr}"
             # None came: then it is about how the command was started, or about the last one.
             for number in now or range(len(self._faults)):
                 self.wrong[number] = text

@@ -12,7 +12,7 @@ ITERATIONS: Final = 60
 CHECKPOINT_EVERY: Final = 3
 
 _FIRST, _LAST = 9, 52
-"""Iterations of faults: checkpoints are there, and there is time to hear of a signal."""
+"""Iterations of faults: checkpoints are there, and there is time to handle a signal."""
 
 Outcome = Literal["restarted", "resumed", "ended at once", "nothing happened"]
 Place = Literal["gmi", "leader", "command"]

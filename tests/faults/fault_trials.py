@@ -1,4 +1,4 @@
-"""Runs whatever a deck holds: a case from outside, files that were damaged, strangers, a job."""
+"""Runs whatever a deck holds: a case from outside, damaged files, unknown clients, a job."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from fault_case import run_case
-from fault_deck import ALL_KINDS, OUTER_KINDS, STRANGER_KINDS, Case, Trial
+from fault_clients import can_cluster, run_with_clients
+from fault_deck import ALL_KINDS, CLIENT_KINDS, OUTER_KINDS, Case, Trial
 from fault_disks import can_mount
 from fault_edits import run_edit
 from fault_files import EDITS
@@ -15,7 +16,6 @@ from fault_fixtures import undisturbed
 from fault_jobs import run_job
 from fault_plan import NEED_MOUNT
 from fault_report import Report
-from fault_strangers import can_cluster, run_strangers
 
 from gmijax.machine.opengl import first_opengl, opengls
 
@@ -26,8 +26,8 @@ def run_trial(trial: Trial, scratch: Path, fixtures: Path) -> Report:
         return run_job(trial, scratch, _expected(fixtures))
     if trial.kind in EDITS:
         return run_edit(trial.kind, trial.seed, scratch, fixtures)
-    if trial.kind in STRANGER_KINDS:
-        return run_strangers(trial.kind, trial.seed, scratch)
+    if trial.kind in CLIENT_KINDS:
+        return run_with_clients(trial.kind, trial.seed, scratch)
     return run_case(trial, scratch, fixtures)
 
 
@@ -48,7 +48,7 @@ def _can_draw() -> bool:
 
 
 def _can_be_made(kind: str) -> bool:
-    if kind in STRANGER_KINDS:
+    if kind in CLIENT_KINDS:
         return can_cluster()
     outer = OUTER_KINDS.get(kind)
     if outer is None:

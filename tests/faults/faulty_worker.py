@@ -28,7 +28,7 @@ from gmijax.workers import training_worker
 SCRATCH = Path(os.environ["GMIJAX_FAULTS"])
 SLOW_S = 1.0
 _PACE_S = 0.02
-"""Longest and least time of an iteration, so that a signal is heard before the next fault."""
+"""Longest and least time of an iteration, so that a signal is handled before the next fault."""
 
 
 class Injected(Exception):

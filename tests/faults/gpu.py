@@ -101,7 +101,7 @@ def kill_daemon(job: Job, gmi: int) -> None:
 
 
 def _pipe_directory(pid: int) -> bytes | None:
-    """Where a process meets its MPS daemon, None if nowhere in particular."""
+    """The pipe directory in the environment of a process; None if it has none."""
     try:
         variables = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
     except OSError:

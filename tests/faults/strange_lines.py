@@ -25,7 +25,7 @@ def _leaves(cls: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         for tree in trees:
             yield from _leaves(tree, f"{prefix}{name}.")
         if not trees:
-            # Names and paths meet more code than numbers do.
+            # Names and paths go through more code than numbers do.
             yield from [(prefix + name, kind)] * (4 if str in options else 1)
 
 

@@ -110,9 +110,9 @@ def test_two_nodes_learn_what_one_with_two_gpus_learns(
             list(range(gmis)),
             list(range(gmis, 2 * gmis)),
         ]
-    said = (tmp_path / "two" / "gmi_0" / "stdout.log").read_text()
-    channels = re.findall(r"via (\w+)/", said)
-    assert channels, said
+    log = (tmp_path / "two" / "gmi_0" / "stdout.log").read_text()
+    channels = re.findall(r"via (\w+)/", log)
+    assert channels, log
     assert set(channels) == {"NET"} if way == "sockets" else "NET" not in channels
 
 

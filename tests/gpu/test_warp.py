@@ -52,7 +52,7 @@ def test_a_task_trains_and_no_buffer_is_too_small(
 
 @pytest.mark.parametrize("task", sorted(ON_GPU))
 def test_a_task_steps_as_with_mjx_jax(task: str, tmp_path: Path) -> None:
-    """What the simulator tells of itself too: loops on a GPU have lost that before."""
+    """The simulator's counts of itself too: loops on a GPU have lost that before."""
     done = subprocess.run(
         [sys.executable, str(CHECKOUT / "tests" / "steps_of_both.py"), task],
         cwd=tmp_path,

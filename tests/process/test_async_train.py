@@ -168,9 +168,9 @@ def test_a_job_goes_on_from_its_checkpoint_until_an_agent_is_killed_and_named(
     assert lines[: len(history)] == history
     assert all(line["env_steps"] > before for line in lines[len(history) :])
     kept = _read(find_checkpoint(str(two_and_two), "test") / "episodes.json")
-    told = sum(one["count"] for one in kept["ended"])
-    assert told == history[-1]["window/episodes"]  # The last line is in the last checkpoint.
-    assert lines[len(history)]["window/episodes"] >= min(told, WINDOW_EPISODES)
+    episodes = sum(one["count"] for one in kept["ended"])
+    assert episodes == history[-1]["window/episodes"]  # The last line is in the last checkpoint.
+    assert lines[len(history)]["window/episodes"] >= min(episodes, WINDOW_EPISODES)
 
 
 @pytest.mark.timeout(300)
@@ -196,7 +196,7 @@ def test_an_interrupt_saves_the_whole_job(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "message"),
     [
         (("plan.training_gmis_per_gpu=0",), "plan.training_gmis_per_gpu=0"),
         (("plan.serving_gpus=0", "plan.training_gpus=1"), "plan.serving_gpus=0"),
@@ -208,9 +208,11 @@ def test_an_interrupt_saves_the_whole_job(tmp_path: Path) -> None:
         (("plan.training_gmis_per_gpu=2", "reduce.strategy=mrr"), "reduce.strategy=mrr"),
     ],
 )
-def test_bad_input_starts_nothing(tmp_path: Path, overrides: tuple[str, ...], said: str) -> None:
+def test_bad_input_starts_nothing(
+    tmp_path: Path, overrides: tuple[str, ...], message: str
+) -> None:
     (tmp_path / "point.py").write_text(POINT_TASK)
     done = run_here("train", *SMALL, *overrides, "run.dir=run", cwd=tmp_path)
     assert done.code == 2, done.stderr
-    assert said in done.stderr
+    assert message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1

@@ -9,7 +9,7 @@ from training_jobs import train
 
 
 @pytest.mark.parametrize(
-    ("command", "overrides", "said"),
+    ("command", "overrides", "message"),
     [
         # All checks but the last one are behind.
         ("train", ["run.dir=."], "the run folder exists already"),
@@ -22,11 +22,11 @@ from training_jobs import train
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_two(
-    command: str, overrides: list[str], said: str, tmp_path: Path
+    command: str, overrides: list[str], message: str, tmp_path: Path
 ) -> None:
     done = train(*overrides, cwd=tmp_path, command=command)
     assert done.returncode == 2, done.stderr
-    assert said in done.stderr
+    assert message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert done.stdout == ""
     assert list(tmp_path.iterdir()) == []

@@ -130,5 +130,5 @@ def test_the_example_refuses_the_policy_of_another_task(tmp_path: Path):
         text=True,
         check=False,
     )
-    said = "policy.onnx: the policy of another task: it has 60 observations and 60 actions, "
-    assert (done.returncode, done.stderr) == (1, f"{said}this example 24 and 3\n")
+    message = "policy.onnx: the policy of another task: it has 60 observations and 60 actions, "
+    assert (done.returncode, done.stderr) == (1, f"{message}this example 24 and 3\n")

@@ -77,7 +77,7 @@ def test_a_sweep_ends_without_its_folder(tmp_path: Path) -> None:
     assert not folder.exists()
 
 
-def require_end(job: subprocess.Popen[bytes], cwd: Path, said: str) -> None:
+def require_end(job: subprocess.Popen[bytes], cwd: Path, message: str) -> None:
     assert job.wait(90) == 1
     [line] = (cwd / "stderr.txt").read_text().splitlines()
-    assert line.startswith(said)
+    assert line.startswith(message)

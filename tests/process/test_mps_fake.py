@@ -91,9 +91,9 @@ def test_clients_get_a_private_daemon_per_gpu_that_is_gone_afterwards(mps: FakeM
     plan = planned(here, gpus=2, backend="mps")
     directories = train_and_stop(run, here, plan, ["mps_client", "mps_client"], look)
     assert (run.gmi(0).root / "saved").exists()
-    assert [uuid for uuid, _ in mps.told("start")] == [gpu(0).uuid, gpu(1).uuid]
-    assert len(set(seen)) == len(mps.told("quit")) == 2
-    assert not mps.told("terminate_client")
+    assert [uuid for uuid, _ in mps.commands("start")] == [gpu(0).uuid, gpu(1).uuid]
+    assert len(set(seen)) == len(mps.commands("quit")) == 2
+    assert not mps.commands("terminate_client")
     assert not [process for process in seen if process is None or process.is_running()]
     assert not [path for path in (*directories, run.janitor_log) if path.exists()]
 
@@ -154,7 +154,7 @@ def test_clients_of_a_daemon_that_was_renewed_are_terminated(mps: FakeMps, run: 
         backend.renew(1)
         (mps.pipe_directories()[1] / "clients" / str(os.getpid())).touch()
         backend.terminate(1, [os.getpid()])
-    assert [int(client) for _, client in mps.told("terminate_client")] == [os.getpid()]
+    assert [int(client) for _, client in mps.commands("terminate_client")] == [os.getpid()]
 
 
 def test_clients_are_terminated_before_they_are_killed(mps: FakeMps, run: RunPaths):
@@ -172,14 +172,14 @@ def test_clients_are_terminated_before_they_are_killed(mps: FakeMps, run: RunPat
         open_backend(plan, here, run) as backend,
     ):
         Supervisor(make_launch(run, ["mps_client", "mps_client"], plan), backend).run(kill_first)
-    assert [int(client) for _, client in mps.told("terminate_client")] == [pids[1]]
+    assert [int(client) for _, client in mps.commands("terminate_client")] == [pids[1]]
 
 
-def small_job(run: RunPaths, here: Machine, plan: Plan, told: list[str]) -> Launch:
+def small_job(run: RunPaths, here: Machine, plan: Plan, warnings: list[str]) -> Launch:
     """Its GMIs end at once: `this` is the module of the standard library."""
     write_json(run.plan, plan.to_dict())
     job, kind = make_launch(run, [], plan), JobKind("this")
-    return dataclasses.replace(job, machine=here, kind=kind, on_warning=told.append)
+    return dataclasses.replace(job, machine=here, kind=kind, on_warning=warnings.append)
 
 
 def test_job_takes_turns_where_no_daemon_can_be_started(
@@ -189,9 +189,9 @@ def test_job_takes_turns_where_no_daemon_can_be_started(
     here = machine(1, mps_control=mps.program)
     plan = planned(here, gmis_per_gpu=2)
     assert plan.backend == "mps"
-    told: list[str] = []
-    run_gmis(small_job(run, here, plan, told))
-    [warning] = told
+    warnings: list[str] = []
+    run_gmis(small_job(run, here, plan, warnings))
+    [warning] = warnings
     assert "An instance of this daemon is already running" in warning
     assert "so the GMIs of a GPU take turns; with MPS they were 1.45 to 4.73 times as f" in warning
     written = Plan.from_dict(read_json(run.plan))
@@ -223,8 +223,8 @@ def test_gmis_that_share_a_mig_instance_get_a_daemon_for_it(mps: FakeMps, run: R
     ]
     directories = train_and_stop(run, here, plan, ["mps_client", "train", "mps_client"])
     assert directories[0] == directories[2] != directories[1]
-    assert [device for device, _ in mps.told("start")] == ["MIG-large"]
-    assert len(mps.told("quit")) == 1
+    assert [device for device, _ in mps.commands("start")] == ["MIG-large"]
+    assert len(mps.commands("quit")) == 1
     assert not directories[0].exists()
 
 
@@ -246,10 +246,10 @@ def test_daemon_of_somebody_else_is_used_and_left_alone(
         plan = planned(here, gmis_per_gpu=2, backend="mps")
         directories = train_and_stop(run, here, plan, ["mps_client", "mps_client"])
         assert set(directories) == {pipe_directory}
-        assert len(mps.told("start")) == 1
-        assert not mps.told("quit")
+        assert len(mps.commands("start")) == 1
+        assert not mps.commands("quit")
         assert identify(daemon) is not None
-        # A stranger to it may be of another namespace.
+        # A process that it does not know may be of another namespace.
         with (
             open_backend(plan, here, run) as backend,
             pytest.raises(GmiFailed, match=r"GMI 0 failed: .* PID namespace"),
@@ -280,7 +280,7 @@ def test_two_nodes_of_one_machine_use_the_daemon_of_the_first(
             daemons |= opened.daemons
             leaders.append(opened.leader)
         assert daemons.keys() == {gpu(0).uuid}
-        assert len(mps.told("start")) == 1
+        assert len(mps.commands("start")) == 1
         for gmi, node in enumerate(nodes):
             node.set_addresses(NodeAddresses(gmi, tuple(leaders), b"token"))
             pid = node.start(gmi)
@@ -293,12 +293,12 @@ def test_two_nodes_of_one_machine_use_the_daemon_of_the_first(
         assert failed[0] == 1
         assert "is not a client of the MPS daemon" in failed[1]
         nodes[1].terminate(1, [pid, os.getpid()])
-        assert [int(client) for _, client in mps.told("terminate_client")] == [pid]
+        assert [int(client) for _, client in mps.commands("terminate_client")] == [pid]
         for gmi, node in enumerate(nodes):
             node.order(gmi, "kill")
             while node.poll()[gmi].exit_code is None:
                 time.sleep(0.05)
-    assert len(mps.told("quit")) == 1
+    assert len(mps.commands("quit")) == 1
     assert not [path for path in mps.pipe_directories() if path.exists()]
 
 
@@ -341,9 +341,9 @@ def test_janitor_cleans_up_after_a_killed_controller(mps: FakeMps, run: RunPaths
     # The held GMI gets 8 s to end by itself before the janitor kills it.
     assert not wait_until_gone([*clients, daemon], timeout_s=90)
     wait_until(lambda: not directory.exists(), 60, "its folder is gone")
-    assert len(mps.told("quit")) == 1
+    assert len(mps.commands("quit")) == 1
     # The other one has ended by itself.
-    assert [int(client) for _, client in mps.told("terminate_client")] == [held]
+    assert [int(client) for _, client in mps.commands("terminate_client")] == [held]
 
 
 def _environment_of(process: ProcessId) -> list[bytes]:

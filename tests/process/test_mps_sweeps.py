@@ -110,7 +110,7 @@ def test_a_job_with_several_gpus_uses_the_daemons_of_its_sweep(
         with open_backend(planned(of_job, gpus=2, backend="mps"), of_job, run) as own:
             directories = [own.environment(gmi)[PIPE_VARIABLE] for gmi in (0, 1)]
         assert directories == [backend.environment(gmi)[PIPE_VARIABLE] for gmi in (0, 2)]
-        assert (len(mps.told("start")), len(mps.told("quit"))) == (2, 0)
+        assert (len(mps.commands("start")), len(mps.commands("quit"))) == (2, 0)
 
         MpsControl(mps.program, Path(directories[1])).quit()
         again = json.loads(variables_of(slot, backend)[DAEMONS_VARIABLE])

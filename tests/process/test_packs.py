@@ -289,9 +289,9 @@ def test_a_stop_names_what_has_left_the_group_of_its_job(home: Path) -> None:
     finally:
         for pid in left:
             os.kill(int(pid), signal.SIGKILL)
-    said = (home / "stderr.txt").read_text()
+    stderr = (home / "stderr.txt").read_text()
     for number, pid in enumerate(left):
-        assert re.search(rf"job {number}: process {pid} .*: end it \(kill {pid}\)", said)
+        assert re.search(rf"job {number}: process {pid} .*: end it \(kill {pid}\)", stderr)
 
 
 @pytest.mark.parametrize("ends", ["before the pack", "after it"])
@@ -313,7 +313,7 @@ def test_a_killed_pack_leaves_nothing_of_a_group_whose_leader_has_ended(
         wait_until(lambda: state_of(tmp_path / "all") == "running", 60.0, "the pack has it")
         if ends == "before the pack":
             wait_until(lambda: not leader.exists(), 10.0, "the leader has ended")
-            time.sleep(0.5)  # The pack has told its janitor.
+            time.sleep(0.5)  # The pack has passed it to its janitor.
     finally:
         job.kill()
         job.wait()

@@ -44,9 +44,9 @@ def test_films_have_the_wanted_size_and_play_in_real_time(home: Path):
     assert not (folder / "model.mjb").exists()
 
 
-def check_film(film: Path, fps: float, num_steps: int, said: str) -> None:
+def check_film(film: Path, fps: float, num_steps: int, output: str) -> None:
     """It shows that many steps in real time, in pictures of 200 x 160."""
-    assert f"video: {Path(*film.parts[-5:])}\n" in said
+    assert f"video: {Path(*film.parts[-5:])}\n" in output
     num_frames, duration_s = imageio_ffmpeg.count_frames_and_secs(str(film))
     # Steps of 0.01 s, the start included, and the last picture stays for its own time.
     assert num_frames == -(-(num_steps + 1) // round(100 / fps))

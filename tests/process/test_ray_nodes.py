@@ -116,16 +116,16 @@ def test_agents_teach_trainers_of_two_nodes_and_of_one_when_the_other_dies(
         *("algo.policy_hidden_layer_sizes=[16]", "algo.value_hidden_layer_sizes=[16]"),
         cwd=tmp_path,
     )
-    said = tmp_path / "stderr.txt"
+    stderr = tmp_path / "stderr.txt"
 
     def wait(condition: Any, what: str) -> Any:
         return wait_until(
-            lambda: condition() or job.poll() is not None, 120, f"{what}: {said.read_text()}"
+            lambda: condition() or job.poll() is not None, 120, f"{what}: {stderr.read_text()}"
         )
 
     try:
         wait(lambda: list(run.glob("checkpoints/[0-9]*")), "agents have added to a checkpoint")
-        assert job.poll() is None, said.read_text()
+        assert job.poll() is None, stderr.read_text()
         before = json.loads((run / "plan.json").read_text())
         assert [node["gmis"] for node in before["nodes"]] == [[0, 2], [1, 3]]
         assert before["strategy"] == "mpr"
@@ -138,7 +138,7 @@ def test_agents_teach_trainers_of_two_nodes_and_of_one_when_the_other_dies(
         steps = int(Path(events(run, "start")[-1]["checkpoint"]).name)
         wait(lambda: _steps_learnt(run) > steps, "it learns on")
         job.send_signal(signal.SIGTERM)
-        assert job.wait(120) == 130, said.read_text()
+        assert job.wait(120) == 130, stderr.read_text()
     finally:
         kill(job.pid)
         job.wait()
@@ -165,11 +165,11 @@ def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
     )
     controller = start(*job, cluster.address, cwd=tmp_path)
     try:
-        said = tmp_path / "stderr.txt"
+        stderr = tmp_path / "stderr.txt"
 
         def wait(condition: Any, what: str) -> Any:
             return wait_until(
-                lambda: condition() or controller.poll() is not None, 120, f"{what}: {said}"
+                lambda: condition() or controller.poll() is not None, 120, f"{what}: {stderr}"
             )
 
         wait(lambda: iteration_of(run, 3) > 6, "the job trains")
@@ -189,7 +189,7 @@ def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
         assert json.loads((run / "plan.json").read_text())["layout"] == [[0, 1]]
 
         controller.send_signal(signal.SIGTERM)
-        assert controller.wait(120) == 130, said.read_text()
+        assert controller.wait(120) == 130, stderr.read_text()
         assert not pids_of(run)
         summary = json.loads((run / "summary.json").read_text())
         assert (summary["status"], len(summary["restarts"])) == ("interrupted", 2)

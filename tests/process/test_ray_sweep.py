@@ -52,7 +52,7 @@ def is_below(pid: int, ancestor: int) -> bool:
 
 def test_a_sweep_over_two_nodes_finishes_on_one_when_the_other_is_killed(tmp_path: Path) -> None:
     memory = shared_memory()
-    folder, said = tmp_path / "all", tmp_path / "stderr.txt"
+    folder, stderr = tmp_path / "all", tmp_path / "stderr.txt"
     runs = [folder / f"{job:03d}" for job in range(4)]
 
     def saved_by(raylet: int) -> bool:
@@ -69,10 +69,10 @@ def test_a_sweep_over_two_nodes_finishes_on_one_when_the_other_is_killed(tmp_pat
             wait_until(
                 lambda: saved_by(cluster.second_raylet) or sweep.poll() is not None,
                 150,
-                f"a job on the second node has a checkpoint: {said}",
+                f"a job on the second node has a checkpoint: {stderr}",
             )
             os.kill(cluster.second_raylet, signal.SIGKILL)
-            assert sweep.wait(150) == 0, said.read_text()
+            assert sweep.wait(150) == 0, stderr.read_text()
         finally:
             kill(sweep.pid)
             sweep.wait()

@@ -79,7 +79,7 @@ def test_the_listing_of_the_paper() -> None:
     ]  # fmt: skip
 
 
-def test_timeouts_lose_nothing_and_different_data_are_told() -> None:
+def test_timeouts_lose_nothing_and_different_data_are_reported() -> None:
     plan = gmijax.plan(gmis_per_gpu=2, backend="cpu")
     first, second = launch(plan, role_cases.Disagree())
     two, three = (f"the mean of {count} numbers of float32" for count in (2, 3))
@@ -175,7 +175,9 @@ def test_a_role_of_a_function_with_what_it_uses() -> None:
     assert launch(gmijax.plan(gmis_per_gpu=2, backend="cpu"), Double(), 3.0) == [Found(6.0)] * 2
 
 
-def test_a_module_that_starts_jobs_when_it_is_loaded_is_told_how_to_stop(tmp_path: Path) -> None:
+def test_a_module_that_starts_jobs_when_it_is_loaded_gets_an_error_with_the_remedy(
+    tmp_path: Path,
+) -> None:
     end = 'gmijax.launch(gmijax.plan(backend="cpu"), Give())\n'
     (tmp_path / "give.py").write_text(SCRIPT + end)
     done = python("-c", "import give")

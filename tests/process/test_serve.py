@@ -121,8 +121,8 @@ def test_after_a_kill_the_same_command_goes_on(home: Path, request: pytest.Fixtu
     wait_until(lambda: finished(folder) >= 3, 240, "three shards")
     kill(gmi_pid(run, 0) or 0)
     assert process.wait(timeout=120) == 1
-    said = (home / "stderr.txt").read_text()
-    assert "GMI 0 failed: ended by SIGKILL" in said
+    errors = (home / "stderr.txt").read_text()
+    assert "GMI 0 failed: ended by SIGKILL" in errors
     assert not pids_of(run)
     assert summary_of(home, "kill")["status"] == "failed"
     kept = {shard.arrays: shard.arrays.stat() for shard in DataPaths(folder).finished()}
@@ -171,7 +171,7 @@ def test_an_interrupted_job_leaves_whole_shards(home: Path, request: pytest.Fixt
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "message"),
     [
         (["run.dir=runs/tiny", "env=ant"], "env=ant: run.dir=runs/tiny was trained on point.py"),
         ([*RANDOM, "plan.template=tdg"], "plan.template=tdg: GPU 0 of layout [[0]] has one GMI"),
@@ -180,10 +180,10 @@ def test_an_interrupted_job_leaves_whole_shards(home: Path, request: pytest.Fixt
         ([*RANDOM, "run.dir=runs/tiny"], "acts without the policy of run.dir"),
     ],
 )
-def test_bad_input_starts_nothing(overrides: list[str], said: str, home: Path):
+def test_bad_input_starts_nothing(overrides: list[str], message: str, home: Path):
     before = sorted(home.glob("*"))
     done = run_here("serve", *overrides, cwd=home)
     assert done.code == 2, done.stderr
-    assert said in done.stderr
+    assert message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert sorted(home.glob("*")) == before

@@ -143,9 +143,9 @@ def start_compiler(run: RunPaths) -> subprocess.Popen[str]:
 @pytest.mark.parametrize(
     ("modes", "changes", "message"),
     [
-        (["deaf", "exit_3"], {}, "GMI 1 failed: exit code 3: the last line"),
+        (["ignore_stop", "exit_3"], {}, "GMI 1 failed: exit code 3: the last line"),
         (
-            ["raise_value_error", "deaf"],
+            ["raise_value_error", "ignore_stop"],
             {},
             r"GMI 0 failed: exit code 1: ValueError: the sum is off$",
         ),
@@ -170,7 +170,7 @@ def start_compiler(run: RunPaths) -> subprocess.Popen[str]:
             {"start": 0.5},
             r"GMI 0 failed: did not start and compile within 0.5 s",
         ),
-        # One that hears no order is killed after the grace time.
+        # One that obeys no order is killed after the grace time.
         (["stubborn", "exit_beside_stopped"], {"grace": 0.5}, "GMI 1 failed: exit code 3"),
     ],
 )
@@ -227,7 +227,7 @@ def test_missing_program_half_way_ends_those_that_run(
 
     monkeypatch.setattr(Backend, "started", lose_python)
     with pytest.raises(GmiFailed, match="GMI 1 failed: cannot start /no/such/python: No such"):
-        run_job(cpu_supervisor(run, ["deaf", "deaf"]))
+        run_job(cpu_supervisor(run, ["ignore_stop", "ignore_stop"]))
 
 
 @pytest.mark.parametrize(
@@ -241,7 +241,9 @@ def test_a_signal_lets_gmis_save_and_names_those_that_are_late(
     run: RunPaths, number: int, waits: bool
 ):
     signals = StopSignals()
-    supervisor = cpu_supervisor(run, ["train", "deaf"], signals=signals, waits=waits, stop=3.0)
+    supervisor = cpu_supervisor(
+        run, ["train", "ignore_stop"], signals=signals, waits=waits, stop=3.0
+    )
     with pytest.raises(JobInterrupted, match=r"GMIs \[1\] did not finish within 3 s"):
         run_job(supervisor, once_all_iterate(lambda *_: signals.handle(number)))
     assert (run.gmi(0).root / "saved").exists()
@@ -283,7 +285,7 @@ def test_a_signal_of_a_batch_system_after_ctrl_c_does_not_wait(run: RunPaths):
             sent.append(signals.handle((signal.SIGINT, signal.SIGTERM)[len(sent)]))
 
     with pytest.raises(JobInterrupted, match=r"GMIs \[0\] did not finish within 0.5 s"):
-        run_job(cpu_supervisor(run, ["deaf"], signals=signals, waits=True, stop=0.5), act)
+        run_job(cpu_supervisor(run, ["ignore_stop"], signals=signals, waits=True, stop=0.5), act)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -302,7 +304,10 @@ def test_a_second_request_ends_at_once(
 
     name = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}[number]
     with pytest.raises(JobInterrupted, match=f"by a second {name}; what was not saved yet"):
-        run_job(cpu_supervisor(run, ["deaf", "deaf"], signals=signals, waits=True), stop_again)
+        run_job(
+            cpu_supervisor(run, ["ignore_stop", "ignore_stop"], signals=signals, waits=True),
+            stop_again,
+        )
 
 
 def test_a_signal_while_compiling_ends_at_once(run: RunPaths):
@@ -317,7 +322,7 @@ def test_exception_of_the_callback_ends_all(run: RunPaths):
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        run_job(cpu_supervisor(run, ["deaf", "busy"]), once_all_iterate(fail))
+        run_job(cpu_supervisor(run, ["ignore_stop", "busy"]), once_all_iterate(fail))
     assert identify(read_json(run.gmi(1).root / "helper.json")["pid"]) is None
 
 

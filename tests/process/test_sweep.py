@@ -49,9 +49,9 @@ def test_a_sweep_that_is_killed_goes_on_and_a_job_fails_alone(tmp_path: Path) ->
     whole = tmp_path / "all" / "000" / "summary.json"
 
     def is_through() -> bool:
-        told = tmp_path / "all" / "sweep.csv"  # Written after sweep.json.
+        table = tmp_path / "all" / "sweep.csv"  # Written after sweep.json.
         return first.poll() is not None or (
-            told.exists() and table_states(tmp_path)[:1] == ["completed"]
+            table.exists() and table_states(tmp_path)[:1] == ["completed"]
         )
 
     wait_until(is_through, 250.0, "a job is through")
@@ -105,8 +105,8 @@ def test_a_job_whose_controller_is_killed_goes_on_from_its_checkpoint(tmp_path: 
     wait_until(are_sent, 200.0, "a checkpoint of each")
     assert sweep.wait(timeout=300) == 0, (tmp_path / "stderr.txt").read_text()
     assert states(tmp_path) == ["completed"] * 2
-    said = "its controller was killed by SIGKILL", "a signal from elsewhere interrupted it"
-    for run, why in zip(runs, said, strict=True):
+    reasons = "its controller was killed by SIGKILL", "a signal from elsewhere interrupted it"
+    for run, why in zip(runs, reasons, strict=True):
         events = [json.loads(line) for line in (run / "events.jsonl").read_text().splitlines()]
         assert [e["reason"] for e in events if e["event"] == "again"] == [f"again, after {why}"]
         assert [e["checkpoint"] is not None for e in events if e["event"] == "start"][-1]

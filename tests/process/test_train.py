@@ -198,8 +198,8 @@ def test_a_run_that_starts_again_is_not_traced_again(tmp_path: Path) -> None:
     wait_until(lambda: bool(events(run, "recovered")), 120, "a recovery")
     job.send_signal(signal.SIGINT)
     assert job.wait(timeout=90) == 130
-    said = "run.profile=2:3: not traced again; what there is, is in run/profile"
-    assert said in (tmp_path / "stdout.txt").read_text()
+    message = "run.profile=2:3: not traced again; what there is, is in run/profile"
+    assert message in (tmp_path / "stdout.txt").read_text()
     assert len(list(run.glob("profile/plugins/profile/*"))) == 1
     assert "profile" not in _read(run / "summary.json")
 
@@ -209,7 +209,7 @@ def test_a_run_that_starts_again_is_not_traced_again(tmp_path: Path) -> None:
     "plan",
     [
         ("plan.gmis_per_gpu=2",),
-        # Also while GMIs meet, when a library would rather end them by itself.
+        # Also while GMIs connect, when a library would rather end them by itself.
         ("plan.gpus=2", "reduce.strategy=mrr"),
     ],
     ids=["memory", "rings"],

@@ -81,8 +81,8 @@ def test_a_gmi_that_hangs_in_the_program_of_all_is_named(tmp_path: Path) -> None
     assert pid is not None
     os.kill(pid, signal.SIGSTOP)
     assert job.wait(timeout=90) == 1
-    said = (tmp_path / "stderr.txt").read_text()
-    assert "for GMIs [1]" in said, said
+    stderr = (tmp_path / "stderr.txt").read_text()
+    assert "for GMIs [1]" in stderr, stderr
     wait_until(lambda: not pids_of(run), 60, "all GMIs gone")
 
 

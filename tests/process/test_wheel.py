@@ -155,8 +155,8 @@ def test_train_help_lists_keys_outside_the_checkout(python: Path, tmp_path: Path
 
 def test_it_trains_outside_the_checkout(python: Path, tmp_path: Path):
     steps = f"num_timesteps={2 * STEPS}"
-    said = run([python, "-m", "gmijax.train", *TINY, steps, "run.dir=run"], tmp_path)
-    assert "completed" in said
+    output = run([python, "-m", "gmijax.train", *TINY, steps, "run.dir=run"], tmp_path)
+    assert "completed" in output
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (summary["env"], summary["env_steps"]) == ("ball_balance", 2 * STEPS)
     lines = [json.loads(x) for x in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
@@ -198,8 +198,8 @@ program = jax.export.deserialize(bytearray(open({str(exported)!r}, "rb").read())
 print(jax.jit(program.call)(numpy.zeros((2, 1), "float32")).shape)
 """
     assert run([python, "-c", code], trained).strip() == "(2, 1)"
-    said = gmijax(python, "play", "run.dir=runs/tiny", "video=none", "num_envs=2", cwd=trained)
-    assert "return" in said
+    output = gmijax(python, "play", "run.dir=runs/tiny", "video=none", "num_envs=2", cwd=trained)
+    assert "return" in output
 
 
 def test_what_an_extra_brings_is_named(python: Path, trained: Path):

@@ -100,7 +100,7 @@ def test_newer_weights_are_taken_up_within_an_unroll(tmp_path) -> None:
     assert [version for _, version in sender.taken] == [3, 3, 4]
 
     @jax.jit
-    def told(experience, theirs):
+    def log_prob_of(experience, theirs):
         obs = normalize(theirs.moments, experience.state)
         networks, params = learner.networks, theirs.params
         output = networks.output(params, obs)
@@ -113,7 +113,7 @@ def test_newer_weights_are_taken_up_within_an_unroll(tmp_path) -> None:
         (second, slice(2, 4), bolder),
         (third, slice(None), bolder),
     ):
-        want = told(experience, theirs)[steps]
+        want = log_prob_of(experience, theirs)[steps]
         np.testing.assert_allclose(experience.log_prob[steps], want, rtol=1e-4, atol=1e-4)
 
 
@@ -136,9 +136,9 @@ def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path) -> None:
             wait_until(lambda: added(5), 60, "environments in the checkpoint")
         finally:
             registers.orders.publish(AgentCommand(9, is_ending=True).pack())
-        told = outcome.result(timeout=120)
-    assert told["unrolls"] == 0
-    assert 0 < told["wait_s"] <= sender.waited_s
+        summary = outcome.result(timeout=120)
+    assert summary["unrolls"] == 0
+    assert 0 < summary["wait_s"] <= sender.waited_s
     assert added(9)
     saved = [path.name for path in link.run.checkpoints.glob(".*.partial/gmi_1")]
     assert len(saved) == 2

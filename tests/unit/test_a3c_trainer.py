@@ -38,7 +38,7 @@ class _Arrivals:
 
 
 class _WithAnother(SingleRankCommunicator):
-    """Beside a trainer that has said `other` of its batch."""
+    """Beside a second trainer, whose values of its batch are `other`."""
 
     world_size = 2
     other: np.ndarray

@@ -57,12 +57,12 @@ def _start(config, num_envs: int = N):
 
 
 def _alone(learner):
-    """The update of a job with one trainer, compiled: `(state, batch, weight) -> state, told`."""
+    """The compiled update of a job with one trainer: `(state, batch, weight)` -> state, report."""
     program = jax.jit(partial(update, learner, LocalCollectives(), ()))
 
     def call(state, batch, weight):
-        state, _, told = program(state, (batch, weight))
-        return state, told
+        state, _, report = program(state, (batch, weight))
+        return state, report
 
     return call
 
@@ -110,7 +110,7 @@ def test_an_unroll_is_what_the_environments_did(config) -> None:
         np.testing.assert_array_equal(got.state[0], before)
         np.testing.assert_array_equal(got.bootstrap[0], envs.env.obs)
         assert float(stats.episodes.count) == got.done.any(-1).sum()
-        # A value behind a step is told where time ran out, and nowhere else.
+        # There is a value behind a step where time ran out, and nowhere else.
         np.testing.assert_array_equal(got.cut_value != 0, got.done[..., 1])
         cuts += int(got.done[..., 1].sum())
         before = envs.env.obs
@@ -205,22 +205,22 @@ def test_two_trainers_stay_equal_and_weigh_fresh_unrolls_alike(config) -> None:
     fresh = np.array([1.0] + [0.0] * (N - 1) + [1.0] * N, np.float32)
     weight = fresh * len(fresh) / fresh.sum()
     learn = _alone(learner)
-    alone, said = jax.device_get(learn(state, both, weight))
-    states, _, told = jax.device_get(_together(learner, state, both, weight))
+    alone, measured = jax.device_get(learn(state, both, weight))
+    states, _, both_measured = jax.device_get(_together(learner, state, both, weight))
     a, b = (jax.tree.map(lambda x, k=k: x[k], states) for k in range(2))
     jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
     jax.tree.map(np.testing.assert_array_equal, a.obs_moments, b.obs_moments)
     seen = both.state.reshape(-1, ENV.spec.obs_size)
     np.testing.assert_allclose(a.obs_moments.mean, seen.mean(0), rtol=1e-4, atol=1e-5)
     assert float(a.obs_moments.count) == len(seen)
-    losses = A3cLosses(*(x[0] for x in told.losses))
-    np.testing.assert_allclose(said.losses, losses, rtol=1e-4, atol=1e-6)
-    # Adam divides by the gradient's size: its moments tell how large it was.
+    losses = A3cLosses(*(x[0] for x in both_measured.losses))
+    np.testing.assert_allclose(measured.losses, losses, rtol=1e-4, atol=1e-6)
+    # Adam divides by the gradient's size: its moments show how large it was.
     chex.assert_trees_all_close(alone.opt_state, a.opt_state, rtol=1e-3, atol=1e-6)
     only_fresh = jax.tree.map(lambda x: x[:, fresh > 0], both)
     _, theirs = jax.device_get(learn(state, only_fresh, np.ones(N + 1, np.float32)))
     np.testing.assert_allclose(losses, theirs.losses, rtol=1e-4, atol=1e-6)
-    for one in (said.explained_variance, told.explained_variance[0]):
+    for one in (measured.explained_variance, both_measured.explained_variance[0]):
         np.testing.assert_allclose(one, theirs.explained_variance, rtol=1e-3, atol=1e-4)
 
 
@@ -234,25 +234,25 @@ def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(start, batc
         return gradients(learner, moved, batch, targets, jnp.arange(N))[1]
 
     shares = (np.ones(N), np.r_[1.0, np.zeros(N - 1)], np.zeros(N))
-    told = [losses_of(np.asarray(fresh, np.float32)) for fresh in shares]
+    losses = [losses_of(np.asarray(fresh, np.float32)) for fresh in shares]
     # Of a trainer with fresh unrolls only, one with a twelfth, and one with none.
-    means = A3cLosses(*(sum(parts) / len(parts) for parts in zip(*told, strict=True)))
-    np.testing.assert_allclose(means.steering_kl, told[0].kl, rtol=1e-4)
-    assert float(told[2].steering_kl) == 0.0
+    means = A3cLosses(*(sum(parts) / len(parts) for parts in zip(*losses, strict=True)))
+    np.testing.assert_allclose(means.steering_kl, losses[0].kl, rtol=1e-4)
+    assert float(losses[2].steering_kl) == 0.0
 
 
-def test_learning_rates_of_all_minibatches_are_told(config) -> None:
+def test_learning_rates_of_all_minibatches_are_reported(config) -> None:
     adaptive = dataclasses.replace(
         config, learning_rate_schedule="adaptive_kl", learning_rate=1e-3, desired_kl=1e-7
     )
     learner, state, envs = _start(adaptive)
     _, batch, _ = _unrolled(learner, state, envs)
-    new, told = _alone(learner)(state, batch, jnp.ones(N))
+    new, measured = _alone(learner)(state, batch, jnp.ones(N))
     # The first pass has not moved yet, the others each lower the rate.
     rates = [1e-3, 1e-3 / 1.5, 1e-3 / 1.5**2, 1e-3 / 1.5**3]
-    assert float(told.rates["max"]) == pytest.approx(rates[0])
-    assert float(told.rates["min"]) == pytest.approx(rates[3])
-    assert float(told.rates["mean"]) == pytest.approx(np.mean(rates))
+    assert float(measured.rates["max"]) == pytest.approx(rates[0])
+    assert float(measured.rates["min"]) == pytest.approx(rates[3])
+    assert float(measured.rates["mean"]) == pytest.approx(np.mean(rates))
     assert float(new.learning_rate) == pytest.approx(rates[3])
 
 

@@ -315,19 +315,19 @@ def test_states_of_playground_in_warp_start_over_one_by_one(times: int):
     assert batch.overflows == OVERFLOWS
 
 
-def test_an_overflow_of_playground_in_warp_is_told_in_its_own_step_alone():
+def test_an_overflow_of_playground_in_warp_is_reported_in_its_own_step_alone():
     pytest.importorskip("warp")
     env = from_playground(WarpBalls(), name="balls")
     batch = training_env(env)
     state = batch.init(batch.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
-    step, told, lifted = jax.jit(batch.step), [], []
+    step, reported, lifted = jax.jit(batch.step), [], []
     for _ in range(60):
         before = state.env.obs[:, 2]
         state, out = step(batch.model, state, jnp.zeros((NUM_ENVS, 1)))
-        told.append(int(out.overflowed["contact"]) > 0)
+        reported.append(int(out.overflowed["contact"]) > 0)
         lifted.append(bool((state.env.obs[:, 2] > before).any()))
     assert sum(lifted) == 1
-    np.testing.assert_array_equal(told, lifted)
+    np.testing.assert_array_equal(reported, lifted)
 
 
 def test_an_environment_of_brax_brings_its_model_and_length():
@@ -368,7 +368,7 @@ def test_an_environment_of_brax_brings_its_model_and_length():
         ("ant", {"api": "brax", "episode_length": 3}, "give it to Brax's EpisodeWrapper"),
     ],
 )
-def test_what_cannot_be_made_is_told_in_one_line(name: str, options: Any, message: str):
+def test_what_cannot_be_made_is_an_error_of_one_line(name: str, options: Any, message: str):
     with pytest.raises(ConfigError, match=message):
         make_env(name, **options)
 

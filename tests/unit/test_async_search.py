@@ -113,11 +113,11 @@ def test_a_profile_is_read_when_channels_had_filled(tmp_path: Path):
     run = RunPaths(tmp_path)
     plan = training_plan(compose("algo=a3c", "plan.serving_gmis_per_gpu=2"), machine(0))
     is_enough = ProfileWindow(config, plan, run)
-    told: list[str] = []
+    written: list[str] = []
 
     def with_lines(number: int) -> None:
-        told.extend(json.dumps(line(len(told) + i, 0)) + "\n" for i in range(number))
-        run.metrics.write_text("".join(told))
+        written.extend(json.dumps(line(len(written) + i, 0)) + "\n" for i in range(number))
+        run.metrics.write_text("".join(written))
 
     def gmis(*unrolls: int) -> list[GmiStatus]:
         return [GmiStatus(gmi, "running", n, 1, None) for gmi, n in enumerate(unrolls)]
@@ -221,15 +221,15 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Point]:
 
 
 def decided(*overrides: str) -> tuple[TrainConfig, str, str]:
-    said = io.StringIO()
+    output = io.StringIO()
     config, (reason,) = with_auto_decided(
-        wanted(*overrides), machine(0), Console(file=said, width=400, markup=False)
+        wanted(*overrides), machine(0), Console(file=output, width=400, markup=False)
     )
-    return config, reason, said.getvalue()
+    return config, reason, output.getvalue()
 
 
 def test_a_job_on_one_gpu_gets_numbers_of_gmis(asked: list[Point]):
-    config, reason, said = decided()
+    config, reason, output = decided()
     assert len(asked) == 3
     plan = config.plan
     assert (plan.gmis_per_gpu, plan.serving_gmis_per_gpu, plan.training_gmis_per_gpu) == (1, 2, 1)
@@ -239,7 +239,7 @@ def test_a_job_on_one_gpu_gets_numbers_of_gmis(asked: list[Point]):
         "2 serving GMIs with 128 environments each and 1 training GMI per GPU, jax: 2,560 env"
     )
     assert "2.00 times the best with one serving GMI, 1 + 1 x 128, jax" in reason
-    assert "2 + 1 x 64, jax: 1,280 env steps/s, agents could make 1,280" in said
+    assert "2 + 1 x 64, jax: 1,280 env steps/s, agents could make 1,280" in output
     training_plan(config, machine(0))  # It can be run.
     asked.clear()
     config, _, _ = decided("plan.training_gmis_per_gpu=2")

@@ -80,7 +80,7 @@ def test_the_mean_is_of_all_gpus_and_of_the_time_that_is_asked_for(nvml: Nvml):
 
 
 @pytest.mark.parametrize(("nvml", "gpus"), [(False, (0,)), (True, ())], indirect=["nvml"])
-def test_without_a_monitor_or_a_gpu_nothing_is_said(nvml: Nvml, gpus: tuple[int, ...]):
+def test_without_a_monitor_or_a_gpu_there_is_no_figure(nvml: Nvml, gpus: tuple[int, ...]):
     with BusySms(gpus) as busy:
         pass
     assert busy.between(0.0, time.time()) is None

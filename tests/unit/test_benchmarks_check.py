@@ -105,7 +105,7 @@ def test_processes_and_a_program_are_compared_in_one_call(
 
 
 @pytest.mark.usefixtures("results")
-def test_what_no_file_has_is_said_once():
+def test_what_no_file_has_is_written_once():
     assert TABLES["lgr"]() == ["not measured"]
     (row,) = (line for line in TABLES["claims"]() if "LGR over MPR" in line)
     assert row.split(" | ")[4:6] == ["not measured", ""]
@@ -154,7 +154,7 @@ def test_a_wrong_digit_in_a_table_is_found(tmp_path: Path):
 
 @pytest.mark.usefixtures("results")
 @pytest.mark.parametrize(
-    ("marked", "said"),
+    ("marked", "problem"),
     [
         ("figure: none.json#a/b .2f -->0.72<!-- /figure", "no such file of results"),
         (f"figure: {REFERENCE} over none/a .2f -->0.72<!-- /figure", "runs.json has no"),
@@ -162,10 +162,10 @@ def test_a_wrong_digit_in_a_table_is_found(tmp_path: Path):
     ],
 )
 def test_a_figure_without_a_file_and_an_unknown_table_are_found(
-    tmp_path: Path, marked: str, said: str
+    tmp_path: Path, marked: str, problem: str
 ):
     (found,) = findings(tmp_path, f"<!-- {marked} -->\n")
-    assert said in found
+    assert problem in found
 
 
 @pytest.mark.parametrize(

@@ -51,8 +51,8 @@ def test_without_nccl_a_line_says_what_is_left_out(capsys: pytest.CaptureFixture
         *(("train", way) for way in (ONE_NODE, TWO_NODES["tcp"])),
         *((verb, way) for verb in ("sweep", "pack") for way in (ONE_NODE, JOBS)),
     ]
-    said = capsys.readouterr().err.splitlines()
-    assert [line.rpartition(": ")[2] for line in said] == ["no GPU"] * 2
+    errors = capsys.readouterr().err.splitlines()
+    assert [line.rpartition(": ")[2] for line in errors] == ["no GPU"] * 2
 
 
 @pytest.mark.parametrize(
@@ -69,8 +69,8 @@ def test_a_job_of_a_pack_trains_with_its_part_of_the_memory():
     found = words(Case("pack", 2, JOBS), 0, 1)
     at = found.index("--")
     assert {ADDRESS, "pack.copies=4", "pack.jobs_per_gpu=2"} <= {*found[:at]}
-    told = [text.replace("{run_dir}", "/runs/one/000") for text in found[at + 4 :]]
-    assert compose(*told).plan.memory_fraction == 0.4
+    overrides = [text.replace("{run_dir}", "/runs/one/000") for text in found[at + 4 :]]
+    assert compose(*overrides).plan.memory_fraction == 0.4
 
 
 def case_of(job: str, way: str, *rates: float | None) -> dict[str, Any]:
@@ -118,7 +118,7 @@ def test_the_newest_call_with_one_node_and_two_counts(
     ):
         with ResultsFile(tmp_path / "nodes-nvidia-x.json", "nodes", {}).changing() as written:
             written |= found
-    assert {key: said.text for key, said in two_nodes_over_one().items()} == {
+    assert {key: text.text for key, text in two_nodes_over_one().items()} == {
         "nccl": "0.98",
         **dict.fromkeys(("sockets", "tcp", "jobs"), "not measured"),
     }

@@ -114,9 +114,9 @@ def test_p_against_the_baseline() -> None:
 
 
 def test_a_summary_counts_and_has_quartiles() -> None:
-    told = summary([outcome(0.1 * n, ok=n > 1) for n in range(5)])
-    assert (told["seeds"], told["successes"], told["diverged_steps"]) == (5, 3, 0.0)
-    assert told["final"] == pytest.approx([0.1, 0.2, 0.3])
-    assert told["at_end"]["policy/noise_std_min"] == pytest.approx([0.1, 0.2, 0.3])
+    found = summary([outcome(0.1 * n, ok=n > 1) for n in range(5)])
+    assert (found["seeds"], found["successes"], found["diverged_steps"]) == (5, 3, 0.0)
+    assert found["final"] == pytest.approx([0.1, 0.2, 0.3])
+    assert found["at_end"]["policy/noise_std_min"] == pytest.approx([0.1, 0.2, 0.3])
     assert summary([])["wilson"] is None
     assert quartiles([None]) is None

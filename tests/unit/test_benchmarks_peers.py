@@ -1,4 +1,4 @@
-"""What the benchmark beside other libraries tells both sides, how it counts, and what it keeps."""
+"""How the benchmark beside other libraries sets up both sides, counts, and what it keeps."""
 
 from __future__ import annotations
 
@@ -49,28 +49,28 @@ WITH_BRAX = [name for name, one in COMPARISONS.items() if one.peer == BRAX]
 def test_both_sides_learn_from_as_many_samples(name: str):
     config = compose(*COMPARISONS[name].overrides)
     assert isinstance(config.algo, RolloutConfig)
-    told = brax_training(COMPARISONS[name]).arguments
-    minibatch = told["batch_size"] * told["unroll_length"]
-    assert told["num_envs"] == config.num_envs
+    arguments = brax_training(COMPARISONS[name]).arguments
+    minibatch = arguments["batch_size"] * arguments["unroll_length"]
+    assert arguments["num_envs"] == config.num_envs
     iteration = config.num_envs * config.algo.unroll_length
-    assert minibatch * told["num_minibatches"] == iteration
-    assert told["num_minibatches"] == config.algo.num_minibatches
-    assert told["num_updates_per_batch"] == config.algo.num_updates_per_batch
+    assert minibatch * arguments["num_minibatches"] == iteration
+    assert arguments["num_minibatches"] == config.algo.num_minibatches
+    assert arguments["num_updates_per_batch"] == config.algo.num_updates_per_batch
     # What Brax asserts, and that all parts of its training have as many iterations.
-    assert told["batch_size"] * told["num_minibatches"] % told["num_envs"] == 0
-    assert told["num_timesteps"] % (REPORTS * iteration) == 0
-    assert 0.5 < told["num_timesteps"] / config.num_timesteps < 1.5
+    assert arguments["batch_size"] * arguments["num_minibatches"] % arguments["num_envs"] == 0
+    assert arguments["num_timesteps"] % (REPORTS * iteration) == 0
+    assert 0.5 < arguments["num_timesteps"] / config.num_timesteps < 1.5
 
 
 @pytest.mark.parametrize("name", WITH_BRAX)
-def test_brax_takes_all_that_it_is_told(name: str):
-    told = brax_training(COMPARISONS[name])
-    assert told.arguments.keys() <= inspect.signature(train.train).parameters.keys()
+def test_brax_has_all_arguments_that_it_gets(name: str):
+    training = brax_training(COMPARISONS[name])
+    assert training.arguments.keys() <= inspect.signature(train.train).parameters.keys()
     taken = inspect.signature(networks.make_ppo_networks).parameters
-    assert told.networks.keys() <= taken.keys()
+    assert training.networks.keys() <= taken.keys()
     # Its distribution through tanh always has a standard deviation of its own in every state.
-    if told.networks["distribution_type"] == "tanh_normal":
-        assert told.networks["state_dependent_std"]
+    if training.networks["distribution_type"] == "tanh_normal":
+        assert training.networks["state_dependent_std"]
 
 
 def test_a_short_training_has_the_same_parts():
@@ -82,7 +82,10 @@ def test_a_short_training_has_the_same_parts():
 def test_mjlab_gets_as_many_environments_and_steps_and_no_packages_of_ours(tmp_path: Path):
     name = "anymal, and mjlab's Go1"
     side = Side(name, MJLAB, ("num_envs=1024",), where="/mjlab/bin/python")
-    assert (side.told["num_envs"], side.told["iterations"]) == (1024, round(10e6 / 1024 / 24))
+    assert (side.settings["num_envs"], side.settings["iterations"]) == (
+        1024,
+        round(10e6 / 1024 / 24),
+    )
     words = side.short_command(tmp_path, has_gpu=True)
     assert words[:3] == ["/mjlab/bin/python", "-m", "benchmarks.peers.mjlab_ppo"]
     assert json.loads(Path(words[3]).read_text())["iterations"] == 2
@@ -98,7 +101,7 @@ def test_fast_td3_draws_as_many_transitions_for_each_that_it_makes(tmp_path: Pat
     config = compose(*COMPARISONS[OFF_POLICY].overrides)
     assert isinstance(config.algo, SacConfig)
     side = Side(OFF_POLICY, FAST_TD3, where="/FastTD3")
-    flags = side.told["flags"]
+    flags = side.settings["flags"]
     assert flags["num-envs"] == config.num_envs
     assert flags["batch-size"] * flags["num-updates"] == 8 * flags["num-envs"]
     assert flags["num-updates"] == config.algo.updates_per_step
@@ -109,10 +112,10 @@ def test_fast_td3_draws_as_many_transitions_for_each_that_it_makes(tmp_path: Pat
     assert config.env.settings["push"] == 0
     words = side.short_command(tmp_path, has_gpu=True)
     assert words[:3] == [sys.executable, "-m", "benchmarks.peers.fast_td3"]
-    told = json.loads(Path(words[3]).read_text())
-    assert (told["checkout"], told["impl"]) == ("/FastTD3", "warp")
+    settings = json.loads(Path(words[3]).read_text())
+    assert (settings["checkout"], settings["impl"]) == ("/FastTD3", "warp")
     # Learning has begun, so that its programs are compiled too.
-    assert told["flags"]["total-timesteps"] > flags["learning-starts"] + 2
+    assert settings["flags"]["total-timesteps"] > flags["learning-starts"] + 2
 
 
 @pytest.mark.parametrize(
@@ -123,7 +126,7 @@ def test_fast_td3_draws_as_many_transitions_for_each_that_it_makes(tmp_path: Pat
         ("algo.critic_hidden_layer_sizes=[512,512]", "FastTD3 has three layers"),
     ],
 )
-def test_what_fast_td3_has_no_flag_for_is_told(override: str, message: str):
+def test_settings_that_fast_td3_has_no_flag_for_are_refused(override: str, message: str):
     with pytest.raises(ConfigError, match=re.escape(message)):
         fast_td3_training(COMPARISONS[OFF_POLICY], (override,))
 
@@ -159,15 +162,15 @@ def test_the_curve_of_fast_td3_counts_all_environments_and_ended_episodes(
 
 
 def test_flags_of_fast_td3_are_words():
-    told = fast_td3.words({"num-envs": 4, "amp": True, "use-wandb": False})
-    assert told == ["--num-envs", "4", "--amp", "--no-use-wandb"]
+    words = fast_td3.words({"num-envs": 4, "amp": True, "use-wandb": False})
+    assert words == ["--num-envs", "4", "--amp", "--no-use-wandb"]
 
 
-def test_overrides_change_both_sides_and_bad_ones_are_told():
+def test_overrides_change_both_sides_and_bad_ones_are_refused():
     side = Side("ant, MJX-Warp", BRAX, ("num_envs=512", "algo.learning_rate_schedule=fixed"))
-    assert side.told["arguments"]["batch_size"] == 128
-    assert side.told["arguments"]["learning_rate_schedule"] == "NONE"
-    assert side._replace(trainer=OURS).told.endswith("algo.learning_rate_schedule=fixed")
+    assert side.settings["arguments"]["batch_size"] == 128
+    assert side.settings["arguments"]["learning_rate_schedule"] == "NONE"
+    assert side._replace(trainer=OURS).settings.endswith("algo.learning_rate_schedule=fixed")
     with pytest.raises(ConfigError, match=r"algo\.unroll_length=81: Brax needs 16 equal unrolls"):
         brax_training(COMPARISONS["Brax's ant"], ("algo.unroll_length=81",))
     with pytest.raises(ConfigError, match="algo=a3c: Brax trains by ppo"):
@@ -203,9 +206,13 @@ def test_the_stand_in_makes_one_row_for_each_device():
 
 
 def test_returns_are_of_the_settings_that_ours_are_trained_with():
-    told = returns.told("CheetahRun", ("num_timesteps=20e6",), seed=3)
-    assert (told["suite"], told["env"], told["impl"]) == ("playground", "CheetahRun", "warp")
-    arguments = told["arguments"]
+    settings = returns.settings_of("CheetahRun", ("num_timesteps=20e6",), seed=3)
+    assert (settings["suite"], settings["env"], settings["impl"]) == (
+        "playground",
+        "CheetahRun",
+        "warp",
+    )
+    arguments = settings["arguments"]
     assert (arguments["seed"], arguments["log_training_metrics"]) == (3, True)
     assert (arguments["num_updates_per_batch"], arguments["unroll_length"]) == (16, 30)
     assert arguments["num_timesteps"] == pytest.approx(20e6, rel=0.05)
@@ -224,11 +231,11 @@ def test_returns_are_kept_up_to_where_a_run_failed(
 
     start = runner.start
 
-    def started(told: Sequence[str], variables: dict[str, str], log: Any) -> Any:
-        return start([sys.executable, "-c", script, *told[-2:]], variables, log)
+    def started(words: Sequence[str], variables: dict[str, str], log: Any) -> Any:
+        return start([sys.executable, "-c", script, *words[-2:]], variables, log)
 
     monkeypatch.setattr(runner, "start", started)
-    tasks = {f"a-{seed}": returns.told("PointMass", (), seed) for seed in (0, 1)}
+    tasks = {f"a-{seed}": returns.settings_of("PointMass", (), seed) for seed in (0, 1)}
     curve = [[100, 1.0], [200, 2.0]]
     assert returns.train(tasks, tmp_path, 60.0) == {
         "a-0": {"returns": curve},
@@ -242,22 +249,22 @@ class Fake:
     def __init__(self, broken: str = "") -> None:
         self.now_s, self.broken = 0.0, broken
 
-    def start(self, told: Sequence[str], variables: dict[str, str], log: Any) -> Any:
+    def start(self, words: Sequence[str], variables: dict[str, str], log: Any) -> Any:
         assert "JAX_COMPILATION_CACHE_DIR" in variables
-        return told, log
+        return words, log
 
     def wait_until(self, deadline_s: float, *processes: Any) -> list[int]:
         del deadline_s
         self.now_s += 60.0
-        return [self._end(told, log) for told, log in processes]
+        return [self._end(words, log) for words, log in processes]
 
-    def _end(self, told: Sequence[str], log: Any) -> int:
-        if self.broken and any(self.broken in word for word in told):
+    def _end(self, words: Sequence[str], log: Any) -> int:
+        if self.broken and any(self.broken in word for word in words):
             log.write(b"no such task\n")
             return 1
         points = [(10.0 + n, 100 * n) for n in range(1, 11)]
-        if "gmijax.train" in told:
-            folder = Path(told[-1].removeprefix("run.dir="))
+        if "gmijax.train" in words:
+            folder = Path(words[-1].removeprefix("run.dir="))
             folder.mkdir()
             lines = [
                 json.dumps({"wall_s": 0.5 * s, "env_steps": steps, "return": 2.0})
@@ -265,7 +272,7 @@ class Fake:
             ]
             (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
         else:
-            Path(told[-1]).write_text(json.dumps({"curve": points}))
+            Path(words[-1]).write_text(json.dumps({"curve": points}))
         return 0
 
 
@@ -299,7 +306,9 @@ def test_both_sides_run_in_turn_and_are_kept(tmp_path: Path, monkeypatch: pytest
     assert kept == json.loads(json.dumps(made.file.results))
 
 
-def test_what_does_not_compile_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_side_that_does_not_compile_is_reported_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     made = benchmark(monkeypatch, tmp_path, Fake("brax_ppo"), "Brax's ant", repeats=2)
     cases = made.file.results["cases"]
     assert cases["Brax's ant, Brax"]["runs"] == [{"repeat": 0, "failed": "no such task"}]

@@ -1,4 +1,4 @@
-"""What few runs or no commit back is refused, or is said and planned again."""
+"""Figures of few runs or without a commit are refused, unless marked as such and planned."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import pytest
 
 from benchmarks.evaluation import check, figures
 from benchmarks.evaluation.evidence import Evidence, Source
-from benchmarks.evaluation.figures import rate, ratio, said, said_bounds
+from benchmarks.evaluation.figures import rate, ratio, text_of, text_of_range
 from benchmarks.evaluation.finding import Finding
 from benchmarks.evaluation.planned import unplanned, without_commit
-from benchmarks.evaluation.writer import SAID
+from benchmarks.evaluation.writer import WORD_TABLES
 
 PLAN = """## Measured too seldom
 
@@ -63,11 +63,11 @@ def test_a_ratio_is_of_as_many_runs_as_the_fewer_of_both():
     gain = ratio("new", "thrice", "once")
     assert gain is not None
     assert gain == 2.0
-    assert str(said(gain).evidence) == "H200, 1 run"
-    assert str(said(rate("new", "thrice")).evidence) == "H200, 3 runs"
-    both = said_bounds([rate("new", "thrice"), rate("old", "thrice")])
+    assert str(text_of(gain).evidence) == "H200, 1 run"
+    assert str(text_of(rate("new", "thrice")).evidence) == "H200, 3 runs"
+    both = text_of_range([rate("new", "thrice"), rate("old", "thrice")])
     assert str(both.evidence) == "H200, 3 runs, commit unknown"
-    assert said(rate("none", "thrice")).evidence is None
+    assert text_of(rate("none", "thrice")).evidence is None
 
 
 @pytest.mark.parametrize(
@@ -77,14 +77,14 @@ def test_the_front_page_refuses_few_runs_and_no_commit_even_if_planned(
     tmp_path: Path, evidence: Evidence
 ):
     (found,) = refused(tmp_path, "front", evidence, *(["new"] if evidence.repeats == 2 else []))
-    assert "the front page wants commit and 3 runs" in found.said
+    assert "the front page wants commit and 3 runs" in found.problem
     assert refused(tmp_path, "front", Evidence(3, frozenset([NEW]))) == []
 
 
 def test_other_rows_of_few_runs_are_planned(tmp_path: Path):
     once = Evidence(1, frozenset([NEW, OTHER]))
     (found,) = refused(tmp_path, "advice", once, "new")
-    assert found.said == "is CPU, 1 run, and plan.md has no row of other"
+    assert found.problem == "is CPU, 1 run, and plan.md has no row of other"
     assert refused(tmp_path, "advice", once, "new", "other") == []
     assert refused(tmp_path, "advice", None) == []
 
@@ -92,12 +92,12 @@ def test_other_rows_of_few_runs_are_planned(tmp_path: Path):
 def test_a_planned_file_whose_rows_have_enough_runs_is_done(tmp_path: Path):
     (found,) = refused(tmp_path, "advice", Evidence(3, frozenset([NEW])), "new")
     assert (found.file, found.line, found.text) == ("plan.md", 5, "new")
-    assert found.said.endswith("it is done")
+    assert found.problem.endswith("it is done")
 
 
 def test_a_row_of_words_says_the_evidence_of_its_figures():
     for table in ("front", "advice", "claims"):
-        for line, evidence in SAID[table]():
+        for line, evidence in WORD_TABLES[table]():
             assert evidence is None or f" | {evidence} |" in line
 
 

@@ -56,7 +56,7 @@ def test_a_single_checkpoint_that_walks_is_not_enough():
     assert walks_from([]) is None
 
 
-def test_of_too_few_environments_nothing_is_said():
+def test_too_few_environments_give_no_result():
     assert walks_from([{"walk": {"walks": None}}] * 3) is None
 
 

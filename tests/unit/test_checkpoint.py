@@ -1,4 +1,4 @@
-"""Checkpoints that cannot be used are told in one line."""
+"""Checkpoints that cannot be used are refused in one line."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def restore_with(error: Exception, monkeypatch: pytest.MonkeyPatch, at: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    ("error", "message"),
     [
         (ValueError("trees differ:\nhere\nthere"), "trees differ:"),
         (ValueError(), "ValueError"),
@@ -52,10 +52,10 @@ def restore_with(error: Exception, monkeypatch: pytest.MonkeyPatch, at: Path) ->
     ],
 )
 def test_checkpoint_that_does_not_fit_is_bad_input(
-    error: Exception, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    error: Exception, message: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     with pytest.raises(
-        ConfigError, match=rf"^checkpoint {tmp_path}/learner does not fit this job: {said}$"
+        ConfigError, match=rf"^checkpoint {tmp_path}/learner does not fit this job: {message}$"
     ):
         restore_with(error, monkeypatch, tmp_path)
 

@@ -164,7 +164,7 @@ def test_of_a_run_that_never_began_no_folder_is_left(
 ):
     monkeypatch.chdir(tmp_path)
     config = build("train", TrainConfig, ["env=ant", *overrides])
-    said: list[str] = []
+    messages: list[str] = []
 
     def begin() -> None:
         with opened(config, StartPoint()) as (run, *_):
@@ -172,13 +172,13 @@ def test_of_a_run_that_never_began_no_folder_is_left(
             if left is not None:
                 (run.root / left).parent.mkdir(parents=True, exist_ok=True)
                 (run.root / left).write_text('{"env_steps": 64}\n')
-            said.append(what_is_left(config, run))
+            messages.append(what_is_left(config, run))
             raise error
 
     with pytest.raises(type(error)):
         begin()
     assert len(list(tmp_path.glob("mine"))) + len(list(tmp_path.glob("runs/*"))) == int(stays)
-    assert said[0].startswith("no checkpoint was saved; the run" if stays else "no run folder")
+    assert messages[0].startswith("no checkpoint was saved; the run" if stays else "no run folder")
 
 
 def test_films_of_others_are_not_ours(run: RunPaths):

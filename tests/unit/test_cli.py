@@ -318,7 +318,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("command", "key"),
     [*((one, "run.dir") for one in ("play", "export", "view", "serve")), ("train", "run.resume")],
 )
-def test_a_file_in_place_of_a_run_folder_is_said_to_be_no_folder(
+def test_a_file_in_place_of_a_run_folder_is_refused_as_no_folder(
     command: str, key: str, tmp_path: Path
 ) -> None:
     (tmp_path / "policy.npz").write_text("x")
@@ -347,13 +347,13 @@ def test_a_word_that_names_a_run_is_taken_for_it(word: str, hint: str, tmp_path:
     assert done.stderr == f"gmijax.play: {word}: expected key=value{hint}\n"
 
 
-@pytest.mark.parametrize(("command", "line", "said"), REFUSED)
+@pytest.mark.parametrize(("command", "line", "message"), REFUSED)
 def test_bad_input_is_one_line_and_starts_nothing(
-    command: str, line: str, said: str, tmp_path: Path
+    command: str, line: str, message: str, tmp_path: Path
 ):
     done = run(command, *filter(None, line.split(" ")), cwd=tmp_path)
     assert done.code == 2, done.stderr
-    assert said in done.stderr
+    assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert done.stdout == ""
     assert list(tmp_path.iterdir()) == []
@@ -429,25 +429,25 @@ def test_a_task_that_nobody_chose_is_named_first(
 
 def test_help_lists_every_key(capsys: pytest.CaptureFixture[str]):
     assert command("train", TrainConfig, gmijax.train, ["--help", "all"]) == 0
-    said = capsys.readouterr().out
-    assert "more keys" not in said
+    output = capsys.readouterr().out
+    assert "more keys" not in output
     for key in ("num_envs", "plan.gmis_per_gpu", "algo.learning_rate", "run.resume", "seed"):
-        assert f"\n{key} " in said
-    assert said.index("\nnum_envs ") < said.index("\nenv.name ")
+        assert f"\n{key} " in output
+    assert output.index("\nnum_envs ") < output.index("\nenv.name ")
     assert command("play", PlayConfig, gmijax.train, ["num_envs=4", "-h"]) == 0
 
 
 def test_help_shows_the_usual_keys_or_those_of_a_topic(capsys: pytest.CaptureFixture[str]):
     assert command("train", TrainConfig, gmijax.train, ["--help"]) == 0
-    said = capsys.readouterr().out
-    assert len([line for line in said.splitlines() if re.match(r"[a-z_]+(\.|  )", line)]) < 30
+    output = capsys.readouterr().out
+    assert len([line for line in output.splitlines() if re.match(r"[a-z_]+(\.|  )", line)]) < 30
     for key in ("num_envs", "algo.learning_rate", "run.resume", "eval.every"):
-        assert f"\n{key} " in said
-    assert "more keys: gmijax train --help TOPIC, of algo," in said
+        assert f"\n{key} " in output
+    assert "more keys: gmijax train --help TOPIC, of algo," in output
     assert command("train", TrainConfig, gmijax.train, ["--help", "plan"]) == 0
-    said = capsys.readouterr().out
-    assert "\nplan.template " in said
-    assert "\nrun.dir " not in said
+    output = capsys.readouterr().out
+    assert "\nplan.template " in output
+    assert "\nrun.dir " not in output
     assert command("train", TrainConfig, gmijax.train, ["--help", "plam"]) == 2
     assert "--help plam: no such topic: did you mean plan?" in capsys.readouterr().err
 
@@ -469,8 +469,8 @@ def test_help_fits_eighty_columns(
 def test_every_topic_of_every_command_has_help(name: str, capsys: pytest.CaptureFixture[str]):
     for topic in topics_of(COMMANDS[name]):
         print_help(name, COMMANDS[name], partial(defaults, name), choices, topic)
-        said = capsys.readouterr().out
-        assert topic == "all" or f"\n{topic}." in said
+        output = capsys.readouterr().out
+        assert topic == "all" or f"\n{topic}." in output
 
 
 def test_every_usual_key_is_one_of_a_command():
@@ -484,6 +484,6 @@ def test_every_usual_key_is_one_of_a_command():
 def test_cfg_job_prints_the_composed_configuration(capsys: pytest.CaptureFixture[str]):
     line = ["--cfg", "job", "env=ant", "num_timesteps=30e6"]
     assert command("train", TrainConfig, gmijax.train, line) == 0
-    said = capsys.readouterr().out
-    assert "num_timesteps: 30000000" in said
-    assert "name: ant" in said
+    output = capsys.readouterr().out
+    assert "num_timesteps: 30000000" in output
+    assert "name: ant" in output

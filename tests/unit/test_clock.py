@@ -42,7 +42,7 @@ Stop = Callable[[], None]
 
 @pytest.fixture
 def stop(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stop]:
-    """Stops this process for a while, as far as any clock can tell."""
+    """Stops this process for a while, as far as any clock shows."""
     real, stopped = time.monotonic, [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: real() + stopped[0])
     clock.running_s()

@@ -309,8 +309,8 @@ def test_a_run_folder_that_a_node_does_not_see_is_refused(
     monkeypatch.setattr("gmijax.cluster.checks.SHOWS_S", 0.0)
     monkeypatch.chdir(tmp_path)
     # A node has another working directory, if any: what it is to see is named whole.
-    said = rf"^run\.dir=runs/new: node 10\.0\.0\.2 does not see {tmp_path} or cannot write"
-    with pytest.raises(ConfigError, match=said):
+    message = rf"^run\.dir=runs/new: node 10\.0\.0\.2 does not see {tmp_path} or cannot write"
+    with pytest.raises(ConfigError, match=message):
         require_shared(joined(a_node(sees=False)), tmp_path / "runs" / "new")
     require_shared(joined(a_node(sees=True)), tmp_path / "runs" / "new")
     assert not list(tmp_path.iterdir())
@@ -409,11 +409,11 @@ def test_only_what_ray_says_itself_is_a_lost_node() -> None:
             answer.get()
 
 
-def test_what_nodes_say_of_backends_is_heard_with_their_address(tmp_path: Path) -> None:
+def test_messages_of_nodes_about_backends_have_their_address(tmp_path: Path) -> None:
     plan = plan_on(gpus_of_nodes(1, 1), gmis_per_gpu=2)
     launch = make_launch(RunPaths(tmp_path), ["train"] * 4, plan)
     opened = NodeEndpoints(("10.0.0.2", 1), {}, {})
-    told: list[tuple[Any, ...]] = []
+    calls: list[tuple[Any, ...]] = []
 
     class Returned(FakeAnswer):
         def get(self) -> Any:
@@ -421,7 +421,7 @@ def test_what_nodes_say_of_backends_is_heard_with_their_address(tmp_path: Path) 
 
     def node(**answers: Any) -> NodeHandle:
         def ask(method: str, *arguments: Any) -> FakeAnswer:
-            told.append((method, *arguments))
+            calls.append((method, *arguments))
             return Returned(answers.get(method))
 
         return joined(RemoteNode(ask, 1, "10.0.0.2"))[0]
@@ -437,9 +437,9 @@ def test_what_nodes_say_of_backends_is_heard_with_their_address(tmp_path: Path) 
     backend = BackendOfNodes(launch, nodes)
     with pytest.raises(GmiFailed, match="GMI 2 failed: no client"):
         backend.verify({0: 10, 1: 11, 2: 12, 3: 13})
-    assert told[-2:] == [("verify", {0: 10, 1: 11}), ("verify", {2: 12, 3: 13})]
+    assert calls[-2:] == [("verify", {0: 10, 1: 11}), ("verify", {2: 12, 3: 13})]
     backend.terminate(3, [13])
-    assert told[-1] == ("terminate", 3, [13])
+    assert calls[-1] == ("terminate", 3, [13])
 
 
 def test_a_node_starts_polls_and_ends_gmis(

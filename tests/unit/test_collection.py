@@ -163,7 +163,7 @@ def test_too_many_bad_environments_end_serving_and_the_term_is_named(tmp_path: P
     stats.close()
 
 
-def test_full_buffers_are_counted_and_the_first_is_told(
+def test_full_buffers_are_counted_and_the_first_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     stats, counts = stats_of(tmp_path), no_counts(point_mass().spec)

@@ -85,9 +85,9 @@ def test_a_demo_with_keys_trains_plays_and_says_what_to_look_at(
     monkeypatch.setattr(playing, "play", play)
     monkeypatch.setattr(demo, "show_shipped", lambda *_: None)
     assert main(["demo", "num_timesteps=42", "seed=3"]) == 0
-    said = capsys.readouterr().out
-    assert f"curve of the returns: {run.returns_png}\n" in said
-    assert f"film: {played.mp4}\n" in said
+    output = capsys.readouterr().out
+    assert f"curve of the returns: {run.returns_png}\n" in output
+    assert f"film: {played.mp4}\n" in output
 
 
 @pytest.mark.parametrize(("typed", "meant"), [("trian", "train"), ("hepl", "help")])
@@ -95,8 +95,8 @@ def test_an_unknown_verb_is_one_line_with_a_suggestion(
     typed: str, meant: str, capsys: pytest.CaptureFixture[str]
 ):
     assert main([typed]) == 2
-    said = capsys.readouterr().err
-    assert said == f"gmijax: unknown command {typed!r}: did you mean {meant}?\n"
+    errors = capsys.readouterr().err
+    assert errors == f"gmijax: unknown command {typed!r}: did you mean {meant}?\n"
 
 
 def test_version(capsys: pytest.CaptureFixture[str]):
@@ -126,9 +126,9 @@ def test_listed_sizes_are_those_that_the_task_describes(name: str):
 
 def test_list_envs_names_tasks_and_suites(capsys: pytest.CaptureFixture[str]):
     assert main(["list-envs"]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     for name in (*TASKS, "env=brax", "env=playground", "env=PATH.py:FUNCTION"):
-        assert name in said
+        assert name in output
 
 
 @pytest.mark.parametrize("is_there", [True, False])
@@ -138,9 +138,9 @@ def test_help_marks_tasks_that_are_not_installed(
     missing = {} if is_there else {"brax": "needs x", "go1": "needs y"}
     monkeypatch.setattr(cli_help, "missing_of", missing.get)
     assert main(["train", "--help"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert ("brax*, custom" in said, "go1*, go1_rough," in said) == (not is_there,) * 2
-    assert ("* not installed: gmijax list-envs prints what to install" in said) != is_there
+    output = " ".join(capsys.readouterr().out.split())
+    assert ("brax*, custom" in output, "go1*, go1_rough," in output) == (not is_there,) * 2
+    assert ("* not installed: gmijax list-envs prints what to install" in output) != is_there
     assert main(["list-envs"]) == 0
 
 
@@ -152,7 +152,9 @@ def test_help_marks_tasks_that_are_not_installed(
         (0, "ball_balance", "gmijax train env=ball_balance"),
     ],
 )
-def test_without_a_gpu_nobody_is_told_to_train_for_hours(num_gpus: int, task: str, command: str):
+def test_without_a_gpu_no_command_that_trains_for_hours_is_suggested(
+    num_gpus: int, task: str, command: str
+):
     purpose, line = training_of(task, has_gpu=bool(num_gpus))
     assert line == command
     assert ("needs a GPU" in purpose) == (task not in command)

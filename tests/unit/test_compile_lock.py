@@ -71,7 +71,7 @@ def test_without_locks_nobody_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert compile_alone(tmp_path / "file" / "cache", "jit_f", "k", lambda: "program") == "program"
 
 
-def test_who_waits_is_told_and_finds_what_was_compiled(
+def test_a_process_that_waits_reports_it_and_finds_what_was_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[str] = []

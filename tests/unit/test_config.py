@@ -78,8 +78,8 @@ def test_weights_and_settings_are_those_of_the_task(task: str):
 
 
 def test_names_of_a_custom_task_are_free():
-    told = ("env=some.py:make", "env.rewards.near=2", "env.settings.length_m=0.5")
-    config = compose(*told).env
+    overrides = ("env=some.py:make", "env.rewards.near=2", "env.settings.length_m=0.5")
+    config = compose(*overrides).env
     assert (config.rewards, config.settings) == ({"near": 2.0}, {"length_m": 0.5})
 
 

@@ -43,7 +43,7 @@ def raw(content: bytes) -> Callable[[Path], object]:
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (fifo, r"cannot be read \(not a regular file\)"),
         (Path.mkdir, r"cannot be read \(not a regular file\)"),
@@ -62,11 +62,11 @@ def raw(content: bytes) -> Callable[[Path], object]:
     ],
 )
 def test_what_is_no_json_object_is_one_line(
-    tmp_path: Path, make: Callable[[Path], object], said: str
+    tmp_path: Path, make: Callable[[Path], object], message: str
 ):
     path = tmp_path / "file.json"
     make(path)
-    with pytest.raises(ConfigError, match=f"^{path}: {said}") as error:
+    with pytest.raises(ConfigError, match=f"^{path}: {message}") as error:
         read_json(path)
     assert len(str(error.value).splitlines()) == 1
 
@@ -203,8 +203,8 @@ def test_a_job_of_a_pack_with_a_damaged_summary_says_how_to_run_it_again(
     run.root.mkdir()
     run.summary.write_text("{")
     pack = build_pack(["seed=1,2"], ["echo", "{seed}"])
-    said = r"^job_1/summary\.json: broken \(.*\); remove it to run job 1 again$"
-    with pytest.raises(ConfigError, match=said):
+    message = r"^job_1/summary\.json: broken \(.*\); remove it to run job 1 again$"
+    with pytest.raises(ConfigError, match=message):
         pack.state_of(run, pack.jobs[1])
 
 
@@ -233,7 +233,7 @@ def edited(run: RunPaths, key: str, value: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    ("key", "value", "message"),
     [
         ("num_envs", "x", "num_envs=x: expected an integer or auto"),
         ("num_envs", -5, "num_envs=-5: must be "),
@@ -247,7 +247,7 @@ def test_a_wrong_value_that_a_run_has_saved_is_not_blamed_on_the_command(
     resume: str,
     key: str,
     value: object,
-    said: str,
+    message: str,
     run: RunPaths,
     monkeypatch: pytest.MonkeyPatch,
 ):
@@ -256,7 +256,7 @@ def test_a_wrong_value_that_a_run_has_saved_is_not_blamed_on_the_command(
     edited(run, key, value)
     with pytest.raises(ConfigError) as error:
         compose(*folder, f"run.resume={resume}")
-    assert str(error.value).startswith(f"run/config.json: {said}")
+    assert str(error.value).startswith(f"run/config.json: {message}")
 
 
 def test_an_algorithm_without_a_name_is_blamed_on_the_file(
@@ -264,17 +264,17 @@ def test_an_algorithm_without_a_name_is_blamed_on_the_file(
 ):
     monkeypatch.chdir(run.root.parent)
     edited(run, "algo", {"name": "sca"})
-    said = r"^run\.resume=run: its config\.json: algo\.name=sca: expected one of ppo, "
-    with pytest.raises(ConfigError, match=said):
+    message = r"^run\.resume=run: its config\.json: algo\.name=sca: expected one of ppo, "
+    with pytest.raises(ConfigError, match=message):
         compose("run.resume=run")
 
 
 def test_a_wrong_value_of_the_command_is_not_blamed_on_the_file(run: RunPaths):
-    said = r"^num_envs=x: expected an integer or auto$"
-    with pytest.raises(ConfigError, match=said):
+    message = r"^num_envs=x: expected an integer or auto$"
+    with pytest.raises(ConfigError, match=message):
         compose(f"run.resume={run.root}", "num_envs=x")
     edited(run, "num_envs", "y")
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         compose(f"run.resume={run.root}", "num_envs=x")
     assert compose(f"run.resume={run.root}", "num_envs=8").num_envs == 8, "it is mended by it"
 
@@ -286,12 +286,12 @@ def test_a_policy_needs_of_its_run_only_task_and_algorithm(
     edited(run, "num_envs", "x")
     assert trained_config(run.checkpoint(100))[0].name == "ant"
     edited(run, "env.episode_length", "x")
-    said = r"^run/config\.json: env\.episode_length=x: expected an integer or null$"
+    message = r"^run/config\.json: env\.episode_length=x: expected an integer or null$"
     for command in (
         lambda: trained_config(run.checkpoint(100)),
         lambda: compose("run.dir=run", command="serve"),
     ):
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=message):
             command()
 
 

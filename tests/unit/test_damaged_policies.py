@@ -92,7 +92,7 @@ GOOD = {"gmijax_version": '"1"', "obs_size": "3", "action_size": "3"}
 
 
 @pytest.mark.parametrize(
-    ("changes", "options", "said"),
+    ("changes", "options", "message"),
     [
         ({"obs_size": None}, {}, "obs_size=None"),
         ({"action_size": '"3"'}, {}, "action_size='3'"),
@@ -106,7 +106,7 @@ GOOD = {"gmijax_version": '"1"', "obs_size": "3", "action_size": "3"}
     ],
 )
 def test_an_onnx_model_that_is_no_policy_is_bad_input(
-    tmp_path: Path, changes: dict[str, Any], options: dict[str, int], said: str
+    tmp_path: Path, changes: dict[str, Any], options: dict[str, int], message: str
 ):
     path = tmp_path / "policy.onnx"
     model(path, GOOD)
@@ -114,6 +114,6 @@ def test_an_onnx_model_that_is_no_policy_is_bad_input(
     model(
         path, {key: text for key, text in (GOOD | changes).items() if text is not None}, **options
     )
-    with pytest.raises(ConfigError, match=f"^path=.*{said}") as error:
+    with pytest.raises(ConfigError, match=f"^path=.*{message}") as error:
         gmijax.load_policy(path)
     assert len(str(error.value).splitlines()) == 1

@@ -105,7 +105,7 @@ def test_observations_of_another_shape_are_refused(policy: Any, shape: tuple[int
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("nowhere", "no such folder"),
         ("bad.npz", r"bad.npz: is not a folder of a run or .*, and no file .onnx or .stablehlo$"),
@@ -117,12 +117,12 @@ def test_observations_of_another_shape_are_refused(policy: Any, shape: tuple[int
         ("bad.stablehlo", "not a policy of gmijax.export"),
     ],
 )
-def test_a_path_without_a_policy_is_bad_input(tmp_path: Path, name: str, said: str):
+def test_a_path_without_a_policy_is_bad_input(tmp_path: Path, name: str, message: str):
     (tmp_path / "exported").mkdir()
     ExportPaths(tmp_path / "exported").stablehlo.touch()
     if name.startswith("bad"):
         (tmp_path / name).write_bytes(b"\x08\x07 no policy at all" * 9)
-    with pytest.raises(ConfigError, match=f"^path=.*{said}") as error:
+    with pytest.raises(ConfigError, match=f"^path=.*{message}") as error:
         gmijax.load_policy(tmp_path / name)
     assert len(str(error.value).splitlines()) == 1
 
@@ -159,9 +159,9 @@ def test_without_its_package_only_stablehlo_can_be_written(
     monkeypatch.setattr(exporting.importlib, "util", without)
     for wanted in ("onnx", "all"):
         assert export(f"run.dir={run.root}", f"format={wanted}") == 2
-        said = capsys.readouterr().err
-        assert f"format={wanted}: needs the package jax2onnx (pip install" in said
-        assert len(said.splitlines()) == 1
+        message = capsys.readouterr().err
+        assert f"format={wanted}: needs the package jax2onnx (pip install" in message
+        assert len(message.splitlines()) == 1
     assert not (run.root / "export").exists()
     exporting.require_packages(exporting_config("format=stablehlo"))
 

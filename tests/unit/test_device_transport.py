@@ -80,8 +80,8 @@ def test_who_has_joined_a_ring_that_another_cannot_join_gives_it_back(
         with pytest.raises(DeviceMemoryUnavailable, match=r"rings .* GMI 2: ncclSystemError"):
             nccl_ring(rank, ((0, 1, 2),))
 
-    said = "rings between GPUs: ncclSystemError"
-    with pytest.warns(RuntimeWarning, match=said), ThreadPoolExecutor(3) as pool:
+    message = "rings between GPUs: ncclSystemError"
+    with pytest.warns(RuntimeWarning, match=message), ThreadPoolExecutor(3) as pool:
         list(pool.map(come, host_ranks(SIZE, SIZE, SIZE)))
     assert sorted(nccl.given_back) == [("aborted", 0), ("aborted", 1)]
 

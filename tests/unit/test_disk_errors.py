@@ -38,8 +38,8 @@ def test_an_error_of_the_disk_is_one_line(
     verb: str, number: int, exit_code: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert exit_code_of(verb, failing(number)) == exit_code
-    said = f"gmijax.{verb}: runs/x/search.json: {os.strerror(number)}\n"
-    assert capsys.readouterr().err == said
+    message = f"gmijax.{verb}: runs/x/search.json: {os.strerror(number)}\n"
+    assert capsys.readouterr().err == message
 
 
 def test_the_file_that_was_to_be_written_is_named(

@@ -1,4 +1,4 @@
-"""The documents tell the truth about the files of the checkout and the terms of the rewards."""
+"""The documents agree with the files of the checkout and the terms of the rewards."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def test_what_is_broken_is_a_problem(
 ):
     found = diagnose(system(monkeypatch, boards, **changes)).problems
     assert len(found) == len(problems)
-    assert all(text.startswith(said) for text, said in zip(found, problems, strict=True))
+    assert all(text.startswith(message) for text, message in zip(found, problems, strict=True))
 
 
 FAST = {"cuda-bindings": "13.5.0"}
@@ -145,14 +145,14 @@ OLD_DRIVER = {"driver": "570.86.10"}
         ({"mujoco": "4.0.0", "mujoco-mjx": "3.17.0"}, {"boards": ()}, "3.17.0 was never tried"),
     ],
 )
-def test_what_is_missing_or_old_is_told_with_the_command_that_brings_it(
+def test_what_is_missing_or_old_is_named_with_the_command_that_installs_it(
     monkeypatch: pytest.MonkeyPatch,
     versions: dict[str, str | None],
     changes: dict[str, Any],
     note: str | None,
 ):
-    told = {"boards": (H200_MIG_OFF,), **changes}
-    notes = diagnose(system(monkeypatch, versions=versions, **told)).notes
+    hardware = {"boards": (H200_MIG_OFF,), **changes}
+    notes = diagnose(system(monkeypatch, versions=versions, **hardware)).notes
     assert [note in found for found in notes] == [True] if note else notes == ()
 
 
@@ -175,7 +175,7 @@ def test_jax_is_asked_as_a_gmi_would_be_started(monkeypatch: pytest.MonkeyPatch)
     ]
 
 
-def test_a_jax_that_fails_or_hangs_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_a_jax_that_fails_or_hangs_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     program = tmp_path / "python"
     program.write_text("#!/bin/sh\necho 'RuntimeError: no cuda' >&2; exit 1\n")
     program.chmod(0o755)
@@ -199,9 +199,9 @@ def test_the_report_names_everything(
     plain = json.loads(json.dumps(found.to_dict()))
     assert plain["gpus"][0]["instances"][6]["num_sms"] == 14
     doctor.show(found, UserConsole(markup=False, width=140, soft_wrap=True))
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     for part in ("1g.10gb: 14 SMs", "MIG on", "[[0],[1]]", "problem: GPU 1", "NVIDIA H200"):
-        assert part in said
+        assert part in output
 
 
 def test_exit_code_says_whether_something_is_broken(
@@ -215,7 +215,7 @@ def test_exit_code_says_whether_something_is_broken(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["--jsn"], "--jsn: expected one of --json, --verbose, mig=SIZES"),
         (["gpu=1"], "gpu=1: only together with mig="),
@@ -229,13 +229,13 @@ def test_bad_arguments_are_one_line_and_exit_code_two(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     arguments: list[str],
-    said: str,
+    message: str,
 ):
     here = machine_of(monkeypatch, H200_MIG_OFF)
     monkeypatch.setattr(doctor, "detect_machine", lambda: here)
     assert doctor.main(arguments) == 2
     error = capsys.readouterr().err
-    assert error.startswith(f"gmijax.doctor: {said}")
+    assert error.startswith(f"gmijax.doctor: {message}")
     assert error.count("\n") == 1
 
 
@@ -245,8 +245,8 @@ def test_commands_for_a_split_are_printed(
     here = machine_of(monkeypatch, fake_nvml.V100, H200_MIG_OFF)
     monkeypatch.setattr(doctor, "detect_machine", lambda: here)
     assert doctor.main(["mig=3g,2g,1g,1g"]) == 0
-    said = capsys.readouterr().out
-    assert "sudo nvidia-smi mig -i 1 -cgi 3g.71gb:4,2g.35gb:2,1g.18gb:1,1g.18gb:0 -C\n" in said
+    output = capsys.readouterr().out
+    assert "sudo nvidia-smi mig -i 1 -cgi 3g.71gb:4,2g.35gb:2,1g.18gb:1,1g.18gb:0 -C\n" in output
 
 
 @pytest.mark.parametrize(
@@ -300,13 +300,13 @@ def test_without_a_gpu_the_table_has_what_only_gpus_have_for_those_who_ask(
     ):
         console.is_verbose = verbose
         doctor.show(diagnose(system(monkeypatch, boards, jax=CPU)), console)
-        said = capsys.readouterr().out
-        assert ("\nreducer" in said) == ("\nbackend" in said) == shown
-        assert "\nphysics" in said
+        output = capsys.readouterr().out
+        assert ("\nreducer" in output) == ("\nbackend" in output) == shown
+        assert "\nphysics" in output
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         (
             "cluster.engine=ray: the package ray is not installed",
@@ -316,11 +316,11 @@ def test_without_a_gpu_the_table_has_what_only_gpus_have_for_those_who_ask(
     ],
 )
 def test_errors_of_a_cluster_name_what_was_typed(
-    wrong: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    wrong: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refuse(*_: object) -> None:
         raise ConfigError(wrong)
 
     monkeypatch.setattr("gmijax.cluster.survey.RayCluster", refuse)
     assert doctor.main(["cluster=auto"]) == 2
-    assert capsys.readouterr().err == f"gmijax.doctor: cluster=auto: {said}\n"
+    assert capsys.readouterr().err == f"gmijax.doctor: cluster=auto: {message}\n"

@@ -108,7 +108,7 @@ def test_the_result_does_not_depend_on_the_number_of_gmis(config: TrainConfig) -
                 assert found.metrics[name] == pytest.approx(alone.metrics[name], rel=1e-5), name
 
 
-def test_all_give_up_when_one_has_heard_that_the_job_is_to_end(config: TrainConfig) -> None:
+def test_all_give_up_when_one_has_been_asked_to_end_the_job(config: TrainConfig) -> None:
     evaluations, beats = evaluate(config, 2, lambda rank, beats: (rank, beats) == (1, 2))
     assert beats == [2, 2]
     for evaluation in evaluations:

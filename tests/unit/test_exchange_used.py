@@ -13,7 +13,7 @@ from gmijax.workers.training_worker import exchange_used
 
 
 @pytest.mark.parametrize(
-    ("planned", "strategy", "intra", "said"),
+    ("planned", "strategy", "intra", "used"),
     [
         ("mpr", "mpr", "host", {}),
         ("one_shot", "one_shot", "ipc", {}),
@@ -22,17 +22,17 @@ from gmijax.workers.training_worker import exchange_used
         ("har", "har", "host", {"intra": "host"}),
     ],
 )
-def test_a_fall_back_to_host_memory_is_told(
+def test_a_fall_back_to_host_memory_is_reported(
     planned: str,
     strategy: str,
     intra: str,
-    said: dict[str, str],
+    used: dict[str, str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("gmijax.partition.reduction.is_installed", lambda *_: True)
     plan = make_plan(machine(1), {"strategy": planned}, gmis_per_gpu=2, backend="share")
     comm: Any = SimpleNamespace(strategy=strategy, intra=intra, inter=None)
-    assert exchange_used(plan, comm) == said
+    assert exchange_used(plan, comm) == used
     # On several nodes also how these exchange.
     comm.inter = "tcp"
-    assert exchange_used(plan, comm) == said | {"inter": "tcp"}
+    assert exchange_used(plan, comm) == used | {"inter": "tcp"}

@@ -1,4 +1,4 @@
-"""Signals that reach a command where no job hears them."""
+"""Signals that reach a command where no job handles them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,9 @@ def test_a_signal_interrupts_a_command(
 
 
 @pytest.mark.parametrize("handler", [signal.SIG_IGN, lambda *_: None])
-def test_signals_that_somebody_ignores_or_hears_are_left_alone(handler: signal.Handlers) -> None:
+def test_signals_that_are_ignored_or_handled_already_are_left_alone(
+    handler: signal.Handlers,
+) -> None:
     signal.signal(signal.SIGHUP, handler)
     assert exit_code_of("play", lambda: signal.raise_signal(signal.SIGHUP)) == 0
     assert signal.getsignal(signal.SIGHUP) is handler

@@ -137,12 +137,12 @@ def test_the_newest_of_those_that_wait_is_filmed(tmp_path: Path, monkeypatch: py
 
 
 def test_a_job_that_fails_does_not_wait_for_films(tmp_path: Path):
-    said: list[str] = []
+    messages: list[str] = []
     run = RunPaths(tmp_path)
     EpisodeFilms(config_of("eval.video=true"), env_with_model(), run)
-    with pytest.raises(RuntimeError), filmed("egl", run, said.append):
+    with pytest.raises(RuntimeError), filmed("egl", run, messages.append):
         raise RuntimeError
-    assert (said, run.film_log.exists()) == ([], False)
+    assert (messages, run.film_log.exists()) == ([], False)
     assert list(run.videos.iterdir()) == []
 
 
@@ -150,26 +150,26 @@ def test_a_job_that_fails_does_not_wait_for_films(tmp_path: Path):
 def test_a_film_that_is_given_up_is_named_with_the_seconds_of_the_wait(
     is_well: bool, waited: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    said: list[str] = []
+    messages: list[str] = []
     process = SimpleNamespace(send=lambda _: None, end=lambda _: False)
     monkeypatch.setattr("gmijax.control.films.SideProcess", lambda *_, **__: process)
     with (
         nullcontext() if is_well else pytest.raises(RuntimeError),
-        filmed("egl", RunPaths(tmp_path), said.append),
+        filmed("egl", RunPaths(tmp_path), messages.append),
     ):
         if not is_well:
             raise RuntimeError
-    assert said == [f"eval.video: the last film was given up after {waited}"]
+    assert messages == [f"eval.video: the last film was given up after {waited}"]
 
 
 def test_what_cannot_be_drawn_is_one_line_and_no_error(tmp_path: Path):
-    said: list[str] = []
+    messages: list[str] = []
     run = RunPaths(tmp_path)
     films = EpisodeFilms(config_of("eval.video=true"), env_with_model(), run)
     films.take(100, episodes())
     run.filmed_model.write_bytes(b"no model")
-    with filmed("no-such-gl", run, said.append):
+    with filmed("no-such-gl", run, messages.append):
         pass
-    (line,) = (line for line in said if line != "filming the last evaluation")
+    (line,) = (line for line in messages if line != "filming the last evaluation")
     assert line.startswith("eval.video: no more films are made: ")
     assert run.to_film(100).exists()

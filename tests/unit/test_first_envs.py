@@ -37,7 +37,7 @@ def test_more_environments_than_memory_holds_are_refused_before_there_is_one(
         begin(10**10)
 
 
-def test_what_fits_is_told_and_is_taken(monkeypatch: pytest.MonkeyPatch):
+def test_what_fits_is_named_and_is_taken(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(memory, "detect_host", lambda: HostLimits(memory_mib=1))
     with pytest.raises(ConfigError, match=r"allowed: .*num_envs less than") as refused:
         begin(10**6)

@@ -74,7 +74,7 @@ def test_the_mean_of_three_has_the_same_bits_on_every_way(pool: ThreadPoolExecut
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_ranks_that_ask_for_different_things_are_told_both(
+def test_the_error_of_ranks_that_ask_for_different_things_names_both(
     first: int, pool: ThreadPoolExecutor
 ) -> None:
     """By messages and by a reducer, whoever comes first."""
@@ -94,7 +94,7 @@ def test_ranks_that_ask_for_different_things_are_told_both(
     while first == 0 and not exchanges[0].barrier.step:
         pass
     others = [pool.submit(reduce, rank) for rank in range(RANKS) if rank != first]
-    told = [one.result() for one in (early, *others)]
-    for said in told:
-        assert "the mean of 8192 numbers of float32" in said
-        assert "the sum of 8192 numbers of float32" in said
+    messages = [one.result() for one in (early, *others)]
+    for message in messages:
+        assert "the mean of 8192 numbers of float32" in message
+        assert "the sum of 8192 numbers of float32" in message

@@ -1,4 +1,4 @@
-"""Who gets in at a listener of a job, and what strangers cost: real sockets on loopback."""
+"""Who gets in at a listener of a job, and what clients without the key cost: real sockets."""
 
 from __future__ import annotations
 
@@ -68,13 +68,14 @@ def come(listener: socket.socket, key: Key = KEY, timeout_s: float = 20.0) -> th
     return thread
 
 
-def stranger(listener: socket.socket, sent: bytes = b"") -> socket.socket:
+def unknown_client(listener: socket.socket, sent: bytes = b"") -> socket.socket:
+    """The connection of a client without the key."""
     connection = socket.create_connection(listener.getsockname(), 5.0)
     connection.sendall(sent)
     return connection
 
 
-def is_hung_up_on(connection: socket.socket, timeout_s: float = 10.0) -> bool:
+def is_closed_by_peer(connection: socket.socket, timeout_s: float = 10.0) -> bool:
     connection.settimeout(timeout_s)
     try:
         while connection.recv(4096):
@@ -94,34 +95,34 @@ def test_both_ends_learn_that_the_other_knows_the_key(listener: socket.socket) -
 
 @pytest.mark.parametrize("kind", SENT)
 @pytest.mark.parametrize("leaves", [False, True])
-def test_who_proves_nothing_is_hung_up_on_and_keeps_nobody_out(
+def test_a_client_without_proof_is_disconnected_and_keeps_nobody_out(
     kind: str, leaves: bool, listener: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(handshake, "PROOF_TIMEOUT_S", 0.2)
-    with stranger(listener, SENT[kind]) as other:
+    with unknown_client(listener, SENT[kind]) as other:
         if leaves:
             other.shutdown(socket.SHUT_WR)
         thread = come(listener)
         assert first(listener) == CALLER
         thread.join()
         assert first(listener, 0.3) is None
-        assert is_hung_up_on(other)
+        assert is_closed_by_peer(other)
 
 
-def test_who_sends_a_byte_now_and_then_has_no_more_time_than_others(
+def test_a_client_that_sends_slowly_has_no_more_time_than_others(
     listener: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(handshake, "PROOF_TIMEOUT_S", 0.3)
-    with stranger(listener) as other:
+    with unknown_client(listener) as other:
         started_s = time.monotonic()
-        hearing = threading.Thread(target=first, args=(listener, 2.0))
-        hearing.start()
+        accepting = threading.Thread(target=first, args=(listener, 2.0))
+        accepting.start()
         with suppress(ConnectionError):
             while time.monotonic() - started_s < 2.0:
                 other.sendall(b"x")
                 time.sleep(0.02)  # 72 of them would take 1.5 s.
         assert time.monotonic() - started_s < 1.3
-        hearing.join()
+        accepting.join()
 
 
 def _proof_of_another_call(listener: socket.socket) -> bytes:
@@ -131,30 +132,30 @@ def _proof_of_another_call(listener: socket.socket) -> bytes:
         connection, _ = other.accept()
         with connection:
             connection.settimeout(5.0)
-            heard = connection.recv(32, socket.MSG_WAITALL)
+            received = connection.recv(32, socket.MSG_WAITALL)
             connection.sendall(bytes(32))
-            heard += connection.recv(40, socket.MSG_WAITALL)
+            received += connection.recv(40, socket.MSG_WAITALL)
         thread.join()
-    return heard
+    return received
 
 
 def test_what_was_sent_once_proves_nothing_later(listener: socket.socket) -> None:
-    heard = _proof_of_another_call(listener)
-    assert len(heard) == 72
-    with stranger(listener, heard) as other:
+    received = _proof_of_another_call(listener)
+    assert len(received) == 72
+    with unknown_client(listener, received) as other:
         assert first(listener, 0.5) is None
-        assert is_hung_up_on(other)
+        assert is_closed_by_peer(other)
 
 
 def test_what_the_listener_sends_proves_nothing_to_itself(listener: socket.socket) -> None:
-    with ThreadPoolExecutor(1) as pool, stranger(listener, bytes(32)) as other:
-        heard = pool.submit(first, listener, 0.5)
+    with ThreadPoolExecutor(1) as pool, unknown_client(listener, bytes(32)) as other:
+        answer = pool.submit(first, listener, 0.5)
         nonce = other.recv(32, socket.MSG_WAITALL)
         caller = struct.pack("<II", *CALLER)
         # The proof that the listener itself would send.
         other.sendall(caller + KEY.proof(b"hears", caller, bytes(32) + nonce))
-        assert heard.result() is None
-        assert is_hung_up_on(other)
+        assert answer.result() is None
+        assert is_closed_by_peer(other)
 
 
 @pytest.mark.parametrize("key", [Key(os.urandom(32), "node 0"), Key(KEY.token, "node 1")])
@@ -183,10 +184,10 @@ def test_a_caller_does_not_trust_a_listener_without_the_token() -> None:
         thread.join()
 
 
-def test_many_silent_ones_keep_nobody_out_and_few_are_held(listener: socket.socket) -> None:
+def test_many_silent_clients_keep_nobody_out_and_few_are_held(listener: socket.socket) -> None:
     """More than the listener would hold, and all there before the one that counts."""
     with ExitStack() as held:
-        others = [held.enter_context(stranger(listener)) for _ in range(100)]
+        others = [held.enter_context(unknown_client(listener)) for _ in range(100)]
         started_s = time.monotonic()
         thread = come(listener)
         with closing(accepted(listener, KEY, seconds(20.0))) as callers:
@@ -194,13 +195,13 @@ def test_many_silent_ones_keep_nobody_out_and_few_are_held(listener: socket.sock
             held.callback(connection.close)
             assert caller == CALLER
             assert time.monotonic() - started_s < handshake.PROOF_TIMEOUT_S
-            waiting = [one for one in others if not is_hung_up_on(one, 0.001)]
+            waiting = [one for one in others if not is_closed_by_peer(one, 0.001)]
             assert len(waiting) <= handshake.MAX_UNAUTHENTICATED
         thread.join()
-        assert all(is_hung_up_on(one) for one in others)
+        assert all(is_closed_by_peer(one) for one in others)
 
 
-def test_who_was_hung_up_on_to_make_room_calls_again(listener: socket.socket) -> None:
+def test_a_caller_that_was_disconnected_to_make_room_calls_again(listener: socket.socket) -> None:
     thread = come(listener)
     dropped, _ = listener.accept()
     dropped.close()
@@ -227,7 +228,7 @@ def test_a_lack_of_descriptors_passes(listener: socket.socket) -> None:
         thread.join()
 
 
-def test_nobody_at_the_address_is_told_from_somebody_who_does_not_answer() -> None:
+def test_no_listener_and_a_silent_listener_are_different_errors() -> None:
     with listen(HERE) as gone:
         address = gone.getsockname()
     with pytest.raises(Unreachable, match="Connection refused"):
@@ -238,19 +239,19 @@ def test_nobody_at_the_address_is_told_from_somebody_who_does_not_answer() -> No
 
 
 @contextmanager
-def knocking(listener: socket.socket, kind: str) -> Iterator[None]:
-    """Five strangers, who come again when they are hung up on."""
+def disturbed(listener: socket.socket, kind: str) -> Iterator[None]:
+    """Five clients without the key, which connect again when their connection is closed."""
     over = threading.Event()
 
-    def knock() -> None:
+    def disturb() -> None:
         while not over.is_set():
-            with suppress(OSError), stranger(listener, SENT.get(kind, b"")) as other:
+            with suppress(OSError), unknown_client(listener, SENT.get(kind, b"")) as other:
                 while not over.wait(0.005 if kind == "noise" else 0.05):
                     other.sendall(b"x" if kind == "drip" else b"")
                     if kind == "noise":
                         break
 
-    threads = [threading.Thread(target=knock) for _ in range(5)]
+    threads = [threading.Thread(target=disturb) for _ in range(5)]
     for thread in threads:
         thread.start()
     yield
@@ -260,22 +261,22 @@ def knocking(listener: socket.socket, kind: str) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("kind", ["drip", "silent", "noise"])
-def test_leaders_meet_or_give_up_in_time_whoever_else_knocks(kind: str) -> None:
-    """Node 1 comes to node 0, whatever strangers do; node 2 never comes."""
+def test_leaders_connect_or_give_up_in_time_whoever_else_connects(kind: str) -> None:
+    """Node 1 comes to node 0, whatever other clients do; node 2 never comes."""
     with ExitStack() as held:
         listeners = [held.enter_context(listen(HERE)) for _ in range(3)]
         addresses = tuple((HERE, one.getsockname()[1]) for one in listeners)
-        held.enter_context(knocking(listeners[0], kind))
+        held.enter_context(disturbed(listeners[0], kind))
         time.sleep(0.1)
 
-        def meet(node: int) -> str:
+        def error_of(node: int) -> str:
             with pytest.raises(CollectiveError) as caught:
                 connect(NodeAddresses(node, addresses, KEY.token), listeners[node], 2, 1.0)
             return str(caught.value)
 
         started_s = time.monotonic()
         with ThreadPoolExecutor(2) as pool:
-            answers = list(pool.map(meet, (0, 1)))
+            answers = list(pool.map(error_of, (0, 1)))
         assert time.monotonic() - started_s < 2.0
     assert answers == [
         f"node {node}: the leaders of other nodes did not come: 2" for node in (0, 1)

@@ -33,7 +33,7 @@ def replaced(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("harm", "said"),
+    ("harm", "message"),
     [
         (
             lambda folder: folder.rename(folder.with_name("b")),
@@ -49,14 +49,14 @@ def replaced(folder: Path) -> None:
     ],
 )
 def test_a_folder_that_is_gone_is_noticed(
-    tmp_path: Path, harm: Callable[[Path], object], said: str
+    tmp_path: Path, harm: Callable[[Path], object], message: str
 ):
     folder = tmp_path / "x" / "a"
     folder.mkdir(parents=True)
     with locked(folder / ".lock", "run.dir=a") as held:
         held.require()
         harm(folder)
-        with pytest.raises(FolderLost, match=f"^run.dir=a: the folder {said.format(tmp_path)}"):
+        with pytest.raises(FolderLost, match=f"^run.dir=a: the folder {message.format(tmp_path)}"):
             held.require()
 
 

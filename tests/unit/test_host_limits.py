@@ -60,7 +60,7 @@ def test_too_many_agents_or_trainers_are_refused(side: str):
         (HostLimits(open_files=84), "96 open files (84 may still be opened, see ulimit -n)", 5),
     ],
 )
-def test_each_limit_is_told(host: HostLimits, needs: str, most: int):
+def test_each_limit_is_named(host: HostLimits, needs: str, most: int):
     with pytest.raises(ConfigError) as error:
         planned(two_cores(host), gmis_per_gpu=8)
     assert str(error.value) == (

@@ -49,7 +49,7 @@ def hostile(tmp_path: Path) -> Path:
     for name in ("random", "queue", "statistics", "runpy", "optax", "gmijax/__init__"):
         file = folder / f"{name}.py"
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text("raise SystemExit('a stranger')\n")
+        file.write_text("raise SystemExit('wrong module')\n")
     return folder
 
 

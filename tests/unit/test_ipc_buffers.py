@@ -41,10 +41,10 @@ class Counted(FakeDeviceMemory):
 
 def test_what_was_made_before_a_failure_is_closed() -> None:
     (host,) = host_ranks(SIZE)
-    said = "wish: GMI 0: no more memory"
+    message = "wish: GMI 0: no more memory"
     with (
         pytest.warns(RuntimeWarning, match="wish: no more memory"),
-        pytest.raises(DeviceMemoryUnavailable, match=said),
+        pytest.raises(DeviceMemoryUnavailable, match=message),
     ):
         IpcBuffers(host, SIZE, [0], [0, 0], Counted, "wish")
     assert Counted.num_open == 0

@@ -14,7 +14,7 @@ from gmijax.sweeps.progress import Progress
 
 
 def events_of(progress: Progress, *changes: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Names of the events with the attempt, where that is told; each change is seen once."""
+    """Names of the events with the attempt, where there is one; each change is seen once."""
     stream = io.StringIO()
     job: Any = SimpleNamespace(number=0, overrides={}, num_timesteps=None, progress=progress)
     events = JobEvents(stream, "pack", [job], SweepPaths(Path("all")))
@@ -22,8 +22,8 @@ def events_of(progress: Progress, *changes: dict[str, Any]) -> list[tuple[str, A
         for name, value in change.items():
             setattr(progress, name, value)
         events.update()
-    told = map(json.loads, stream.getvalue().splitlines())
-    return [(event["event"], event.get("attempt")) for event in told][1:]
+    written = map(json.loads, stream.getvalue().splitlines())
+    return [(event["event"], event.get("attempt")) for event in written][1:]
 
 
 def test_a_job_that_ended_before_anybody_looked_has_started():

@@ -64,9 +64,9 @@ def test_a_damaged_request_is_called_so(
     (folder / "request.json").write_text(content)
     assert command() == EXIT_BAD_INPUT
     (line,) = capsys.readouterr().err.splitlines()
-    said, _, advice = line.partition(": ")[2].rpartition("; ")
-    assert said.startswith("all/request.json: broken (")
-    assert why.removesuffix(".*") in said
+    message, _, advice = line.partition(": ")[2].rpartition("; ")
+    assert message.startswith("all/request.json: broken (")
+    assert why.removesuffix(".*") in message
     assert advice == "give another folder"
     assert (folder / "request.json").read_text() == content
 
@@ -130,6 +130,6 @@ def test_a_folder_in_the_place_of_a_report_is_bad_input_and_is_named(
     (folder / name).mkdir()
     capsys.readouterr()
     assert command() == EXIT_BAD_INPUT
-    said = capsys.readouterr().err
-    assert said.startswith(f"gmijax.{command.__name__}: all/{name}: ")
-    assert len(said.splitlines()) == 1
+    errors = capsys.readouterr().err
+    assert errors.startswith(f"gmijax.{command.__name__}: all/{name}: ")
+    assert len(errors.splitlines()) == 1

@@ -1,4 +1,4 @@
-"""What is said of a training that is large for a machine without a GPU."""
+"""Warnings about a training that is large for a machine without a GPU."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def test_shipped_settings_of_robots_are_for_a_gpu_and_the_small_try_is_allowed(
 ) -> None:
     config = compose(f"env={env}", f"algo={algo}")
     assert large_on_cpu(config, on_cpu=False) == ()
-    said = large_on_cpu(config, on_cpu=True)
+    warnings = large_on_cpu(config, on_cpu=True)
     if env == "ball_balance":
-        assert said == ()
+        assert warnings == ()
         return
-    (line,) = said
+    (line,) = warnings
     assert f"{config.num_envs:,} environments for {config.num_timesteps:,} steps" in line
     words = line.rpartition("add ")[2].split()
     assert "num_envs=64" in words
@@ -48,7 +48,7 @@ def test_shipped_settings_of_robots_are_for_a_gpu_and_the_small_try_is_allowed(
     ],
 )
 def test_it_goes_by_environments_and_steps(overrides: tuple[str, ...], is_large: bool) -> None:
-    said = large_on_cpu(compose(*overrides), on_cpu=True)
-    assert bool(said) == is_large
+    warnings = large_on_cpu(compose(*overrides), on_cpu=True)
+    assert bool(warnings) == is_large
     is_sac = "algo=sac" in overrides
-    assert all(bool(re.search(r" algo\.batch_size=\d+$", line)) == is_sac for line in said)
+    assert all(bool(re.search(r" algo\.batch_size=\d+$", line)) == is_sac for line in warnings)

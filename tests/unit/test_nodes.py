@@ -37,7 +37,7 @@ TOKEN = b"secret"
 HERE = "127.0.0.1"
 
 
-def meet(tokens: Sequence[bytes], timeout_s: float = 10.0) -> list[Any]:
+def connect_all(tokens: Sequence[bytes], timeout_s: float = 10.0) -> list[Any]:
     """The connections of every leader, or its error."""
     with ExitStack() as held:
         listeners = [held.enter_context(listen(HERE)) for _ in tokens]
@@ -64,7 +64,7 @@ def meshes(request: pytest.FixtureRequest) -> Iterator[list[Mesh]]:
             rendezvous_timeout_s=timeout_s,
             on_wait=lambda: None,
         )
-        for node, sockets in enumerate(meet([TOKEN] * num_nodes))
+        for node, sockets in enumerate(connect_all([TOKEN] * num_nodes))
     ]
     yield found
     for mesh in found:
@@ -75,7 +75,7 @@ def meshes(request: pytest.FixtureRequest) -> Iterator[list[Mesh]]:
 def watches(request: pytest.FixtureRequest) -> Iterator[list[LeaderWatch]]:
     num_nodes = getattr(request, "param", 2)
     ids = [10 * node for node in range(num_nodes)]
-    sockets = meet([TOKEN] * num_nodes)
+    sockets = connect_all([TOKEN] * num_nodes)
     found = [LeaderWatch(own, node, ids) for node, own in enumerate(sockets)]
     yield found
     for watch in found:
@@ -158,7 +158,7 @@ def test_time_counts_only_while_a_leader_is_silent(watches: list[LeaderWatch]) -
     for _ in range(8):
         time.sleep(0.1)
         other.beat()
-        mine.look(since_s, 0.5, "step", 3)  # It is heard, for longer than the limit.
+        mine.look(since_s, 0.5, "step", 3)  # It sends signs of life, for longer than the limit.
     waited: list[int] = []
     with pytest.raises(
         CollectiveTimeout, match=r"waited 0\.5 s in step .*for GMIs \[10\]"
@@ -171,7 +171,7 @@ def test_time_counts_only_while_a_leader_is_silent(watches: list[LeaderWatch]) -
 
 
 def test_who_does_not_know_the_secret_stays_out() -> None:
-    answers = meet([TOKEN, b"guess"], timeout_s=1.0)
+    answers = connect_all([TOKEN, b"guess"], timeout_s=1.0)
     assert "leaders of other nodes did not come" in str(answers[0])
     assert "has a connection with node 0 at 127.0.0.1" in str(answers[1])
     assert "cluster.interface" not in str(answers[1])

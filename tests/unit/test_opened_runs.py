@@ -107,16 +107,16 @@ def test_a_damaged_checkpoint_is_named_by_every_command(
     (newest / META).write_text("{")
     with pytest.raises(StartedError):
         opened(kind)
-    said = "checkpoint theirs/checkpoints/000000000200: passed over, broken meta.json (not JSON"
-    assert said in capsys.readouterr().out
+    message = "checkpoint theirs/checkpoints/000000000200: passed over, broken meta.json (not JSON"
+    assert message in capsys.readouterr().out
 
 
 def test_play_hands_its_child_the_file_that_it_looked_at(run: RunPaths, starts: None):
     with pytest.raises(StartedError):
         opened("play", "env=point.py:make")
-    told = json.loads((run.root / "play" / f"{100:012d}" / "config.json").read_text())["run"]
+    given = json.loads((run.root / "play" / f"{100:012d}" / "config.json").read_text())["run"]
     digest = hashlib.sha256(TRAP.encode()).hexdigest()
-    assert (told["env"], told["env_sha256"]) == (f"{Path('point.py').resolve()}:make", digest)
+    assert (given["env"], given["env_sha256"]) == (f"{Path('point.py').resolve()}:make", digest)
 
 
 def test_play_takes_no_other_task(run: RunPaths):

@@ -97,8 +97,11 @@ def test_a_command_that_cannot_print_its_answer_has_failed(
             check=False,
         )
         found.append((done.returncode, done.stderr))
-    said = f"{name}: the output cannot be written "
-    assert found[:2] == [(1, f"{said}(No space left on device)\n"), (1, f"{said}(it is closed)\n")]
+    message = f"{name}: the output cannot be written "
+    assert found[:2] == [
+        (1, f"{message}(No space left on device)\n"),
+        (1, f"{message}(it is closed)\n"),
+    ]
     assert found[2] == (0, "")  # A reader that is gone has read enough.
 
 
@@ -147,13 +150,13 @@ UNKNOWN = ("async/staleness_mean", "channel/occupancy")
     ],
 )
 def test_a_job_tells_its_rate_and_return_or_of_its_channels(more: dict[str, Any], part: str):
-    assert part in _told([{**SYNC, **more}])
+    assert part in _last_line([{**SYNC, **more}])
 
 
 def test_a_job_tells_its_latest_evaluation():
     evaluated = {**SYNC, "eval/return": 9.5}
-    assert _told([evaluated, SYNC]).endswith("return 7.25  eval 9.50")
-    assert "eval" not in _told([SYNC])
+    assert _last_line([evaluated, SYNC]).endswith("return 7.25  eval 9.50")
+    assert "eval" not in _last_line([SYNC])
 
 
 def test_without_a_terminal_a_line_is_printed_once():
@@ -172,9 +175,9 @@ def test_a_summary_has_the_rates_that_were_measured(
     tmp_path: Path, rates: tuple[float | None, ...], line: str
 ):
     summary = {**SUMMARY, "final_return": None, **dict(zip(RATES, rates, strict=True))}
-    told = train_outcome(summary, RunPaths(tmp_path)).splitlines()
-    assert [text for text in told if "steps/s" in text] == [f"env steps/s: {line}"] * bool(line)
-    assert told[:2] == ["completed: 10 env steps in 0:01", "no episode has ended"]
+    lines = train_outcome(summary, RunPaths(tmp_path)).splitlines()
+    assert [text for text in lines if "steps/s" in text] == [f"env steps/s: {line}"] * bool(line)
+    assert lines[:2] == ["completed: 10 env steps in 0:01", "no episode has ended"]
 
 
 def test_a_run_that_ended_in_its_first_iteration_says_so(tmp_path: Path):
@@ -182,36 +185,36 @@ def test_a_run_that_ended_in_its_first_iteration_says_so(tmp_path: Path):
     plan = make_plan(config.plan, config.reduce, 64, machine(0))
     summary = train_summary(config, plan, run, "failed", 1.0, [])
     assert summary["env_steps"] is None
-    told = train_outcome(summary, run).splitlines()
-    assert told[:2] == ["failed: no env steps in 0:01", "no episode has ended"]
+    lines = train_outcome(summary, run).splitlines()
+    assert lines[:2] == ["failed: no env steps in 0:01", "no episode has ended"]
 
 
-def _told(lines: list[dict[str, Any]]) -> str:
-    """What is told in the end of a job that wrote these lines at once."""
+def _last_line(lines: list[dict[str, Any]]) -> str:
+    """The last line of output for a job that wrote these lines at once."""
     return _lines(lines)[-1]
 
 
 def _lines(lines: list[dict[str, Any]]) -> list[str]:
-    left, said = list(lines), io.StringIO()
+    left, output = list(lines), io.StringIO()
 
     def new() -> list[dict[str, Any]]:
         found = left.copy()
         left.clear()
         return found
 
-    with ConsoleProgress(Console(file=said, width=300, markup=False), new, 1000) as progress:
+    with ConsoleProgress(Console(file=output, width=300, markup=False), new, 1000) as progress:
         progress.update(())
-    return said.getvalue().splitlines()
+    return output.getvalue().splitlines()
 
 
 def panel(gmis: Sequence[GmiStatus], *lines: dict[str, Any], num_timesteps: int = 10) -> str:
     """What a terminal of eighty columns shows while it is open."""
-    said = io.StringIO()
-    console = Console(file=said, width=80, force_terminal=True, color_system=None)
+    output = io.StringIO()
+    console = Console(file=output, width=80, force_terminal=True, color_system=None)
     left = list(lines)
     with ConsoleProgress(console, lambda: [left.pop()] if left else [], num_timesteps) as shown:
         shown.update(gmis)
-        text = said.getvalue()
+        text = output.getvalue()
     return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text).replace("\r", "")
 
 
@@ -229,7 +232,7 @@ WHY = "compiling: once for each task and size, "
 
 
 class Clock:
-    """Stands still unless it is told to go on."""
+    """Stands still unless a test moves it."""
 
     now_s = 1000.0
 
@@ -254,8 +257,8 @@ def compile_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[]
 def test_while_it_compiles_a_job_says_why_and_for_how_long(
     clock: Clock, compile_time: Callable[[], CompileTime]
 ):
-    said = io.StringIO()
-    with ConsoleProgress(Console(file=said, width=80), list, 10, compile_time()) as shown:
+    output = io.StringIO()
+    with ConsoleProgress(Console(file=output, width=80), list, 10, compile_time()) as shown:
         for states, seconds in (
             (("starting",), 0),
             (("compiling",), 5),
@@ -265,7 +268,7 @@ def test_while_it_compiles_a_job_says_why_and_for_how_long(
         ):
             clock.now_s += seconds
             shown.update(_status(*states))
-    assert said.getvalue().splitlines() == [
+    assert output.getvalue().splitlines() == [
         "starting: loading JAX, building the environments  0:00",
         f"{WHY}up to 3 minutes  0:00",
         f"{WHY}up to 3 minutes  0:31",
@@ -278,12 +281,12 @@ def test_the_next_time_a_job_knows_how_long_it_compiles(
     clock: Clock, compile_time: Callable[[], CompileTime]
 ):
     compile_time().note(42.0)
-    said = io.StringIO()
-    shown = ConsoleProgress(Console(file=said, width=300), list, 10, compile_time())
+    output = io.StringIO()
+    shown = ConsoleProgress(Console(file=output, width=300), list, 10, compile_time())
     shown.update(_status("compiling"))
     clock.now_s += 100
     shown.update(_status("compiling"))
-    assert said.getvalue().splitlines() == [
+    assert output.getvalue().splitlines() == [
         f"{WHY}last time 0:42  0:00",
         f"{WHY}last time 0:42, longer now  1:40",
     ]
@@ -293,13 +296,13 @@ def test_the_next_time_a_job_knows_how_long_it_compiles(
 def test_a_job_without_metrics_says_what_it_does_once_it_runs(
     clock: Clock, compile_time: Callable[[], CompileTime]
 ):
-    said, compiled = io.StringIO(), compile_time()
-    console = Console(file=said, width=300)
+    output, compiled = io.StringIO(), compile_time()
+    console = Console(file=output, width=300)
     with ConsoleProgress(console, list, 0, compiled, "playing 16 episodes") as shown:
         for state in ("starting", "compiling", "running", "running"):
             shown.update(_status(state))
             clock.now_s += 20
-    assert said.getvalue().splitlines() == [
+    assert output.getvalue().splitlines() == [
         "starting: loading JAX, building the environments  0:00",
         f"{WHY}up to 3 minutes  0:00",
         "compiled in 0:20",
@@ -309,15 +312,15 @@ def test_a_job_without_metrics_says_what_it_does_once_it_runs(
 
 
 def test_an_eta_goes_by_the_latest_iterations_and_not_by_the_first(clock: Clock):
-    left, told = TimeLeft(), []
+    left, estimates = TimeLeft(), []
     for seconds, steps in ((0, 10), (9, 20), (1, 20), (1, 30), (1, 130), (9, 1030), (60, 7030)):
         clock.now_s += seconds
         left.note(steps)
-        told.append(left.seconds(10_000))
-    assert told[:4] == [None] * 4  # Reports are too few; what is noted twice is one.
-    assert told[4:] == pytest.approx([987.0, 8970 / (1020 / 21), 2970 / (7000 / 70)], rel=0.1)
+        estimates.append(left.seconds(10_000))
+    assert estimates[:4] == [None] * 4  # Reports are too few; what is noted twice is one.
+    assert estimates[4:] == pytest.approx([987.0, 8970 / (1020 / 21), 2970 / (7000 / 70)], rel=0.1)
     clock.now_s += 10
-    assert left.seconds(10_000) == pytest.approx((told[-1] or 0) - 10)
+    assert left.seconds(10_000) == pytest.approx((estimates[-1] or 0) - 10)
     assert left.seconds(7030) is None
     left.note(0)  # Started again.
     assert left.seconds(10_000) is None
@@ -347,29 +350,31 @@ def test_broken_notes_of_compile_times_are_no_error(
     ],
 )
 def test_the_phase_of_several_gmis_is_that_of_the_job(states: tuple[str, ...], phase: str):
-    said = io.StringIO()
-    ConsoleProgress(Console(file=said, width=300), list, 10).update(_status(*states))
+    output = io.StringIO()
+    ConsoleProgress(Console(file=output, width=300), list, 10).update(_status(*states))
     # Without a figure there is nothing to say of a job that runs.
-    assert said.getvalue().partition(" ")[0].strip(":") == ("" if phase == "running" else phase)
+    assert output.getvalue().partition(" ")[0].strip(":") == ("" if phase == "running" else phase)
 
 
 @pytest.mark.parametrize("is_terminal", [False, True])
-def test_what_a_stop_waits_for_is_said_once(is_terminal: bool, monkeypatch: pytest.MonkeyPatch):
+def test_a_stop_names_once_what_it_waits_for(is_terminal: bool, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("gmijax.control.display.REFRESH_S", 0.0)
-    said = io.StringIO()
-    console = Console(file=said, width=300, force_terminal=is_terminal)
+    output = io.StringIO()
+    console = Console(file=output, width=300, force_terminal=is_terminal)
     with ConsoleProgress(console, list, 10) as shown:
         for state in ("running", "stopping", "stopping", "done"):
             shown.update(_status(state, state))
-    assert said.getvalue().count("then saving; a second Ctrl-C ends at once, without saving") == 1
+    assert (
+        output.getvalue().count("then saving; a second Ctrl-C ends at once, without saving") == 1
+    )
 
 
 def test_a_stop_names_the_signal_that_asked_for_it():
-    signals, said = StopSignals(), io.StringIO()
+    signals, output = StopSignals(), io.StringIO()
     signals.handle(signal.SIGTERM)
     asked = GmiStatus(0, "stopping", 3, None, None, signals.name)
-    ConsoleProgress(Console(file=said, width=300), list, 10).update((asked,))
-    assert "a second SIGTERM ends at once" in said.getvalue()
+    ConsoleProgress(Console(file=output, width=300), list, 10).update((asked,))
+    assert "a second SIGTERM ends at once" in output.getvalue()
 
 
 def test_a_pack_does_not_say_that_programs_of_others_save():
@@ -377,22 +382,22 @@ def test_a_pack_does_not_say_that_programs_of_others_save():
     pack = build_pack(["pack.stop_signal=INT", "seed=0,1"], ["echo", "{seed}"])
     lines = []
     for work in (sweep, pack):
-        said = io.StringIO()
-        view = SweepView(Console(file=said, width=300), [], work.ranking, work.stopping)
+        output = io.StringIO()
+        view = SweepView(Console(file=output, width=300), [], work.ranking, work.stopping)
         for _ in range(2):
             view.update("SIGTERM")
-        lines.append(said.getvalue())
+        lines.append(output.getvalue())
     saves, ends = (line.removeprefix("stopping: running jobs ").rstrip() for line in lines)
     assert saves == "save and end; a second SIGTERM ends them at once, without saving"
     assert ends == "get SIGINT and may take 25 s to end; a second SIGTERM ends them at once"
 
 
 def test_figures_of_before_a_restart_are_not_shown_while_it_compiles_again():
-    said = io.StringIO()
-    shown = ConsoleProgress(Console(file=said, width=300), lambda: [SYNC], 1000)
+    output = io.StringIO()
+    shown = ConsoleProgress(Console(file=output, width=300), lambda: [SYNC], 1000)
     for state in ("running", "compiling"):
         shown.update(_status(state))
-    assert ["steps/s" in line for line in said.getvalue().splitlines()] == [True, False]
+    assert ["steps/s" in line for line in output.getvalue().splitlines()] == [True, False]
     assert "steps/s" in panel(_status("running"), SYNC)
     assert "steps/s" not in panel(_status("compiling"), SYNC)
 
@@ -425,9 +430,9 @@ def test_a_run_ends_with_what_to_do_next(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     run = RunPaths(tmp_path / "runs" / "a b")
-    told = train_outcome({**SUMMARY, "checkpoint": str(run.checkpoint(10))}, run)
-    assert "final return 58.80 (with exploration noise, mean of the latest episodes)" in told
-    assert "checkpoint: runs/a b/checkpoints/000000000010\n" in told
+    ending = train_outcome({**SUMMARY, "checkpoint": str(run.checkpoint(10))}, run)
+    assert "final return 58.80 (with exploration noise, mean of the latest episodes)" in ending
+    assert "checkpoint: runs/a b/checkpoints/000000000010\n" in ending
     print_next(open_console(show=True), *next_steps(run))
     assert capsys.readouterr().out.splitlines()[-1] == "  gmijax play run.dir='runs/a b'"
     monkeypatch.chdir("/")
@@ -450,9 +455,9 @@ def test_an_evaluation_says_whether_it_was_with_noise(
     write_json(run.config, {"eval": {"deterministic": deterministic}})
     best = {"env_steps": 5, "return": 8.0, "checkpoint": str(run.checkpoint(5))}
     found = {"last": {"env_steps": 9, "return": 7.5}, "best": best}
-    told = train_outcome({**SUMMARY, "eval": found}, run).splitlines()
-    assert f"evaluation: return 7.50 {how} exploration noise, after 9 env steps" in told
-    assert any(line.startswith("  best 8.00: ") for line in told)
+    lines = train_outcome({**SUMMARY, "eval": found}, run).splitlines()
+    assert f"evaluation: return 7.50 {how} exploration noise, after 9 env steps" in lines
+    assert any(line.startswith("  best 8.00: ") for line in lines)
 
 
 @pytest.mark.parametrize(
@@ -514,7 +519,7 @@ def test_names_in_the_table_of_play_may_look_like_markup():
         "terms": {"near[/]": row},
         "metrics": {"[red]x": row},
     }
-    said = io.StringIO()
-    Console(file=said, width=200, markup=False).print(playing.returns_table(returns))
+    output = io.StringIO()
+    Console(file=output, width=200, markup=False).print(playing.returns_table(returns))
     for name in ("a[/b].py:make", "near[/]", "[red]x"):
-        assert name in said.getvalue()
+        assert name in output.getvalue()

@@ -82,7 +82,7 @@ def test_copies_and_a_file_of_commands(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "message"),
     [
         ("./nosuch.sh", "./nosuch.sh"),
         ("sub/nosuch.sh", "sub/nosuch.sh"),
@@ -92,12 +92,12 @@ def test_copies_and_a_file_of_commands(tmp_path: Path) -> None:
     ],
 )
 def test_a_program_that_is_not_there_is_named_as_it_was_typed(
-    command: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     command = command.replace("{here}", str(tmp_path))
     Path("cmds.txt").write_text(f"# all of them\ntrue\n\n{command} --seed 0\n{command}\n")
-    what = f"{said}: no such program, or it cannot be executed"
+    what = f"{message}: no such program, or it cannot be executed"
     for work, where in (
         (build_pack([], [command]), ""),
         (build_pack(["pack.commands=cmds.txt"], []), "pack.commands=cmds.txt: line 4: "),
@@ -125,7 +125,7 @@ def test_a_value_in_quotes_may_be_empty() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "command", "said"),
+    ("words", "command", "message"),
     [
         ((), (), r"no command: expected gmijax pack"),
         (("seed=0,1",), ("true",), r"^seed=0,1: the command has no \{seed\}"),
@@ -151,8 +151,8 @@ def test_a_value_in_quotes_may_be_empty() -> None:
         (("seed=interval(0,1)",), COMMAND, "use pack.sampler=random or tpe"),
     ],
 )
-def test_bad_input_is_refused(words: Sequence[str], command: Sequence[str], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_bad_input_is_refused(words: Sequence[str], command: Sequence[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         build_pack(words, command)
 
 
@@ -171,8 +171,8 @@ def test_a_sampler_without_names_is_refused(
     Path("commands").write_text("true\n")
     with pytest.raises(ConfigError) as error:
         build_pack([*words, "pack.sampler=random", "pack.trials=4"], command)
-    said = "pack.sampler=random: there is no list or interval to draw from; allowed: grid"
-    assert str(error.value) == said
+    message = "pack.sampler=random: there is no list or interval to draw from; allowed: grid"
+    assert str(error.value) == message
 
 
 def test_lists_that_are_too_long_are_not_read_to_their_end(
@@ -183,15 +183,15 @@ def test_lists_that_are_too_long_are_not_read_to_their_end(
         pytest.fail("read on")
 
     monkeypatch.setattr("sys.stdin", io.StringIO("true\n" * 10_002))
-    said = "^pack.commands=-: line 10001: at most 10,000 jobs are allowed$"
-    with pytest.raises(ConfigError, match=said):
+    message = "^pack.commands=-: line 10001: at most 10,000 jobs are allowed$"
+    with pytest.raises(ConfigError, match=message):
         build_pack(["pack.commands=-"], [])
     with pytest.raises(ConfigError, match=r"^seed: at most 10,000 values"):
         gmijax.pack(COMMAND, {"seed": cast("Any", seeds())})
 
 
 @pytest.mark.parametrize(
-    ("argv", "said"),
+    ("argv", "message"),
     [
         (("--", "no-such-program"), "no-such-program: no such program"),
         (("py=true,no-such", "--", "{py}"), "no-such: no such program"),
@@ -203,15 +203,17 @@ def test_lists_that_are_too_long_are_not_read_to_their_end(
         (("pack.x=1", "--", "true"), "unknown key pack.x"),
     ],
 )
-def test_nothing_is_started_for_bad_input(argv: Sequence[str], said: str, tmp_path: Path) -> None:
+def test_nothing_is_started_for_bad_input(
+    argv: Sequence[str], message: str, tmp_path: Path
+) -> None:
     done = run("pack", *argv, cwd=tmp_path, machine=GPU)
     assert (done.code, done.stdout) == (2, "")
-    assert said in done.stderr
+    assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
-    ("here", "backend", "said"),
+    ("here", "backend", "message"),
     [
         (machine(0), "share", "no usable NVIDIA GPU here; available here: auto"),
         (machine(0), "mps", "no usable NVIDIA GPU here; available here: auto"),
@@ -225,7 +227,9 @@ def test_nothing_is_started_for_bad_input(argv: Sequence[str], said: str, tmp_pa
         (DIVIDED, "mps", "is in MIG mode, and the backend is mps: choose other GPUs"),
     ],
 )
-def test_only_backends_of_packs_are_named(here: Machine, backend: str, said: str, tmp_path: Path):
+def test_only_backends_of_packs_are_named(
+    here: Machine, backend: str, message: str, tmp_path: Path
+):
     done = run(
         "pack",
         f"pack.backend={backend}",
@@ -236,12 +240,12 @@ def test_only_backends_of_packs_are_named(here: Machine, backend: str, said: str
         machine=here,
     )
     assert done.code == 2
-    assert re.search(said, done.stderr)
+    assert re.search(message, done.stderr)
     assert not re.search("plan[.]|backend=(cpu|mig)|, cpu|, mig", done.stderr)
 
 
 @pytest.mark.parametrize(
-    ("command", "grid", "said"),
+    ("command", "grid", "message"),
     [
         (COMMAND, {"seed": []}, "seed: an empty list"),
         (COMMAND, {"seed": iter(())}, "seed: an empty list"),
@@ -254,10 +258,10 @@ def test_only_backends_of_packs_are_named(here: Machine, backend: str, said: str
     ],
 )
 def test_what_is_no_grid_is_refused_before_a_folder_is_made(
-    command: Any, grid: Any, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: Any, grid: Any, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=f"^{said}"):
+    with pytest.raises(ConfigError, match=f"^{message}"):
         gmijax.pack(command, grid)
     assert not list(tmp_path.iterdir())
 
@@ -266,12 +270,12 @@ def test_the_folder_of_a_sweep_is_called_so(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.chdir(tmp_path)
     request = tmp_path / "all" / "request.json"
     request.parent.mkdir()
-    for held, said in (
+    for held, message in (
         ({"jobs": [{"seed": "0"}]}, "holds a sweep; give another folder"),
         ({"commands": [["true"]], "jobs": [{}]}, "holds another pack; give the same command"),
     ):
         request.write_text(json.dumps(held))
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=message):
             gmijax.pack(COMMAND, {"seed": [0]}, run_dir="all")
 
 
@@ -367,7 +371,7 @@ def test_a_job_that_is_started_again_gets_the_words_to_resume(
     assert first.stop_signal == signal.SIGINT
     assert first.variables["NAME"] == "pack003"
     assert first.variables["OMP_NUM_THREADS"] == "4"
-    assert "MKL_NUM_THREADS" not in first.variables  # The user has said it.
+    assert "MKL_NUM_THREADS" not in first.variables  # The user has set it.
     again = kind.start((job,), slot).process
     assert again.arguments == ("true", "003", "--resume", f"{tmp_path}/003/last")
     assert (tmp_path / "003" / "pack" / "output.log").read_text().splitlines() == [
@@ -446,7 +450,7 @@ def test_a_command_that_a_signal_ended_says_so(tmp_path: Path) -> None:
 
 
 class Gpu(LocalHost):
-    """A machine whose GPU has as much memory in use as is said."""
+    """A machine whose GPU has a given amount of memory in use."""
 
     def __init__(self) -> None:
         super().__init__(GPU)

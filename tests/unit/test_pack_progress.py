@@ -89,12 +89,12 @@ _ASYNC = {
     ("more", "rate"), [({"env_steps_per_s": 98269.0}, 98269.0), (_ASYNC, None)]
 )
 def test_what_gmijax_prints_is_read(more: dict[str, float], rate: float | None):
-    lines, said = [{"env_steps": 6400, "return": 12.5, **more}], io.StringIO()
-    console = Console(file=said, width=300)
+    lines, printed = [{"env_steps": 6400, "return": 12.5, **more}], io.StringIO()
+    console = Console(file=printed, width=300)
     with ConsoleProgress(console, lambda: [lines.pop()] if lines else [], 20_000) as progress:
         progress.update([])
     (family,) = (family for family in FAMILIES if family.name == "gmijax")
-    found = [report for line in said.getvalue().splitlines() if (report := family.read(line))]
+    found = [report for line in printed.getvalue().splitlines() if (report := family.read(line))]
     assert found == [Report(steps=6400.0, rate=rate, metric=12.5)]
 
 

@@ -38,7 +38,7 @@ def test_bad_descriptor_in_the_environment_is_named(tmp_path: Path, shown: str):
         ChildLink.from_environment(variables)
 
 
-def test_process_that_is_no_gmi_is_told():
+def test_a_process_that_is_no_gmi_gets_an_error():
     with pytest.raises(ConfigError, match="GMIJAX_GMI and GMIJAX_RUN_DIR must be set"):
         ChildLink.from_environment({})
 
@@ -85,11 +85,11 @@ def test_beats_and_errors_reach_whoever_has_the_memory(
     assert failure.reason == "exit code 1: ValueError: first; second"
     assert (failure.iteration, failure.error) == (7, seen.read_error())
     link.report_error(KeyboardInterrupt())
-    told = describe_exit(3, 1, seen.read_error(), link.paths.stderr)
-    assert told.reason == "exit code 1: KeyboardInterrupt"
+    described = describe_exit(3, 1, seen.read_error(), link.paths.stderr)
+    assert described.reason == "exit code 1: KeyboardInterrupt"
 
 
-def test_an_error_is_told_where_nothing_can_be_written(
+def test_an_error_is_reported_where_nothing_can_be_written(
     tmp_path: Path, block: tuple[int, HeartbeatBlock]
 ):
     (tmp_path / "gmi_3").write_text("a file where the folder should be")
@@ -200,7 +200,9 @@ def test_only_the_end_of_a_long_log_is_read(tmp_path: Path):
 
 
 def test_a_lack_of_memory_is_named_where_xla_hides_it(tmp_path: Path):
-    said = "NOT_FOUND: All configs failed during profiling or were excluded from selection."
-    error = ReportedError("JaxRuntimeError", said, said, ())
+    message = "NOT_FOUND: All configs failed during profiling or were excluded from selection."
+    error = ReportedError("JaxRuntimeError", message, message, ())
     reason = describe_exit(0, 1, error, GmiPaths(tmp_path).stderr).reason
-    assert reason.startswith(f"exit code 1: JaxRuntimeError: {said} (perhaps there is too little")
+    assert reason.startswith(
+        f"exit code 1: JaxRuntimeError: {message} (perhaps there is too little"
+    )

@@ -186,7 +186,7 @@ def test_daemon_gets_none_of_the_users_settings_for_mps(
     )
 
 
-def test_daemon_or_program_that_is_not_there_is_told_in_one_line(tmp_path: Path):
+def test_a_missing_daemon_or_program_is_reported_in_one_line(tmp_path: Path):
     control = MpsControl(script(tmp_path, "echo Cannot find MPS; exit 1"), tmp_path)
     assert not control.is_answering()
     with pytest.raises(BackendUnavailable, match=r"terminate_client 1 2: Cannot find MPS$"):
@@ -243,8 +243,8 @@ def test_a_plan_says_what_else_could_compute_here(
     monkeypatch.setattr(pynvml, "nvmlInit", failing(pynvml.NVML_ERROR_LIBRARY_NOT_FOUND))
     assert detect_machine().warnings == ()
     (no_devices / device).touch()
-    said = f"warning: {no_devices / device} looks like {what}, which gmijax does not use"
-    assert planned(detect_machine()).reasons[0] == said
+    warning = f"warning: {no_devices / device} looks like {what}, which gmijax does not use"
+    assert planned(detect_machine()).reasons[0] == warning
 
 
 @pytest.mark.parametrize(
@@ -267,14 +267,14 @@ def test_a_plan_says_with_which_settings_of_jax_gmis_do_not_compute(
     variable: str, value: str, is_named: bool, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv(variable, value)
-    said = f"warning: GMIs start without {variable}={value}, with which tasks do not work"
-    assert (said in planned(detect_machine()).reasons) == is_named
+    warning = f"warning: GMIs start without {variable}={value}, with which tasks do not work"
+    assert (warning in planned(detect_machine()).reasons) == is_named
 
 
 @pytest.mark.parametrize(
     ("owner", "is_used"), [(os.geteuid(), True), (0, True), (os.geteuid() + 1234, False)]
 )
-def test_a_strangers_daemon_is_not_used(
+def test_a_daemon_of_another_user_is_not_used(
     owner: int, is_used: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     if os.geteuid() != 0:
@@ -291,8 +291,8 @@ def test_a_strangers_daemon_is_not_used(
     script(tmp_path, "exit 0")
     here = detect_machine()
     assert here.operator_daemon == (pipe if is_used else None)
-    said = f"warning: {pipe} belongs to user {owner}, so the MPS daemon there is not used; "
-    assert [text.startswith(said) for text in here.warnings] == [True] * (not is_used)
+    warning = f"warning: {pipe} belongs to user {owner}, so the MPS daemon there is not used; "
+    assert [text.startswith(warning) for text in here.warnings] == [True] * (not is_used)
     # Who names it has decided; but it must answer.
     monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", str(pipe))
     assert detect_machine().operator_daemon == pipe
@@ -303,7 +303,7 @@ def test_a_strangers_daemon_is_not_used(
     assert detect_machine().operator_daemon is None
 
 
-def test_a_link_of_a_strangers_to_a_directory_of_roots_is_not_used(tmp_path: Path):
+def test_a_link_of_another_user_to_a_directory_of_root_is_not_used(tmp_path: Path):
     real, link = tmp_path / "real", tmp_path / "link"
     real.mkdir()
     link.symlink_to(real)

@@ -60,7 +60,7 @@ def test_every_auto_has_a_reason_and_explicit_choices_have_none():
     assert [reason.split()[0] for reason in plan.reasons] == [
         *("backend", "template", "strategy", "intra")
     ]
-    # One GMI is not told how it would exchange.
+    # With one GMI no reason names a way of exchange.
     assert [reason.split()[0] for reason in planned(machine(0)).reasons] == [
         *("backend", "template", "strategy")
     ]

@@ -79,7 +79,7 @@ def test_no_cap_between_the_clean_ones_or_measured_to_be_wrong_counts_as_clean()
         ({"sm_percent": 50.0, "self_check": "off"}, False),
         ({"self_check": "on"}, True),
         ({"backend": "cpu", "self_check": "on"}, True),
-        # Somebody else's daemon may cap its clients and not tell.
+        # A daemon of somebody else may limit its clients without saying so.
         ({"here": {"operator_daemon": Path("/run/mps")}}, True),
         ({"here": {"operator_daemon": Path("/run/mps")}, "self_check": "off"}, False),
         ({"here": {"operator_daemon": Path("/run/mps")}, "backend": "share"}, False),

@@ -113,7 +113,7 @@ def test_arrays_of_any_strides_are_written_without_a_copy_of_theirs(ends: Ends) 
     assert received.ctypes.data % 64 == 0
 
 
-def test_a_full_pipe_and_an_empty_one_wait_no_longer_than_told(ends: Ends) -> None:
+def test_a_full_pipe_and_an_empty_one_wait_no_longer_than_the_limit(ends: Ends) -> None:
     with pytest.raises(CollectiveTimeout, match=r"GMI 1: waited 0.01 s in get.* GMIs \[0\]"):
         ends.reader.get(timeout_s=0.01)
     while ends.writer.try_put([raw(1000)]):
@@ -161,7 +161,9 @@ def test_a_rank_that_is_taken_and_other_memory_are_refused(ends: Ends) -> None:
     os.close(empty)
 
 
-def test_nothing_is_told_before_the_fence(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_announced_before_the_fence(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """That there is one: what it does cannot be seen on x86, which keeps the order anyway."""
     seen: list[int] = []
 

@@ -55,7 +55,7 @@ def test_indices_are_those_of_the_machine() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"serving_gmis_per_gpu": 0}, r"plan.serving_gmis_per_gpu=0: at least one GMI must act"),
         ({"training_gmis_per_gpu": 0}, r"plan.training_gmis_per_gpu=0: .* must train"),
@@ -71,13 +71,13 @@ def test_indices_are_those_of_the_machine() -> None:
         ({"layout": ((0,), (1,))}, r"plan.layout=\[\[0\], \[1\]\]: with the decoupled template"),
     ],
 )
-def test_what_cannot_be_is_refused(changes, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_what_cannot_be_is_refused(changes, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         place(PlanConfig(**changes))
 
 
 @pytest.mark.parametrize(
-    ("overrides", "is_told"),
+    ("overrides", "is_noted"),
     [
         ((), True),
         (("channel.transport=device",), False),
@@ -85,13 +85,13 @@ def test_what_cannot_be_is_refused(changes, said: str) -> None:
         (("plan.serving_gpus=1", "plan.training_gpus=1"), False),
     ],
 )
-def test_jobs_are_told_that_experience_could_stay_on_the_gpu(
-    overrides: tuple[str, ...], is_told: bool, monkeypatch: pytest.MonkeyPatch
+def test_a_plan_notes_that_experience_could_stay_on_the_gpu(
+    overrides: tuple[str, ...], is_noted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reduction, "is_installed", lambda *_: True)
     here, share = machine(2), ("env=ant", "algo=a3c", "plan.backend=share")
     plan = training_plan(compose(*share, *overrides), here)
-    assert any("channel.transport=device keeps" in why for why in plan.reasons) == is_told
+    assert any("channel.transport=device keeps" in why for why in plan.reasons) == is_noted
     if "plan.serving_gpus=1" in overrides:
         config = compose(*share, *overrides, "channel.transport=device")
         with pytest.raises(ConfigError, match="agent 1 is on GPU 0 of the job, where no GMI tr"):

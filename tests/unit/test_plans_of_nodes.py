@@ -151,8 +151,8 @@ def test_nodes_that_cannot_do_the_same_take_turns_or_are_refused_by_name() -> No
     plan = plan_on({**nodes, "10.0.0.1": bare}, gmis_per_gpu=2)
     assert plan.backend == "share"
     assert any("take turns" in why and "(node 10.0.0.1)" in why for why in plan.reasons)
-    said = "warning: nodes differ in NVIDIA driver: 580.159.03 on 10.0.0.0; 575.1 on 10.0.0.1"
-    assert said in plan.reasons
+    warning = "warning: nodes differ in NVIDIA driver: 580.159.03 on 10.0.0.0; 575.1 on 10.0.0.1"
+    assert warning in plan.reasons
     with pytest.raises(
         BackendUnavailable, match=r"node 10\.0\.0\.1: plan\.backend=mps: nvidia-cuda"
     ):

@@ -84,11 +84,11 @@ def test_a_best_checkpoint_that_is_damaged_is_named(run: RunPaths):
 
 
 @pytest.mark.parametrize(
-    ("compared", "is_told"),
+    ("compared", "is_noted"),
     [({}, True), ({"eval_return": -1.0}, False), ({"window_full": True}, False)],
 )
-def test_a_best_checkpoint_that_nothing_was_compared_by_is_told(
-    compared: dict[str, Any], is_told: bool, run: RunPaths, monkeypatch: pytest.MonkeyPatch
+def test_a_best_checkpoint_that_nothing_was_compared_by_is_noted(
+    compared: dict[str, Any], is_noted: bool, run: RunPaths, monkeypatch: pytest.MonkeyPatch
 ):
     env = EnvConfig(name="ant", episode_length=None)
     monkeypatch.setattr(trained_run, "trained_config", lambda checkpoint: (env, None))
@@ -99,7 +99,7 @@ def test_a_best_checkpoint_that_nothing_was_compared_by_is_told(
     for wanted in ("best", str(first)):
         config, _, changed = open_run(config_of(f"run.dir={run.root}", f"checkpoint={wanted}"))
         assert config.checkpoint == str(first.resolve())
-        assert (changed is not None) == (is_told and wanted == "best")
+        assert (changed is not None) == (is_noted and wanted == "best")
 
 
 def test_a_checkpoint_outside_of_its_run_is_bad_input(run: RunPaths, tmp_path: Path):
@@ -175,11 +175,12 @@ def test_a_robot_that_repeats_actions_has_no_walking_test(
     monkeypatch.setattr(trained_run, "left_out", lambda checkpoint: None)
     monkeypatch.setattr(trained_run, "require_env", lambda env: None)
     monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
-    said = "env.action_repeat=2; the walking test takes 1 only"
-    with pytest.raises(ConfigError, match=f"^walking_envs=8: {said}$"):
+    message = "env.action_repeat=2; the walking test takes 1 only"
+    with pytest.raises(ConfigError, match=f"^walking_envs=8: {message}$"):
         playing.play(config_of(f"run.dir={run.root}", "walking_envs=8"))
     assert (
-        playing.walking_lines(config_of(f"run.dir={run.root}"), None) == f"no walking test: {said}"
+        playing.walking_lines(config_of(f"run.dir={run.root}"), None)
+        == f"no walking test: {message}"
     )
     with pytest.raises(ConfigError, match=r"^env.action_repeat=2: the walking test takes 1 only$"):
         walking_env(env, ROBOTS["go1"], "jax", 4)
@@ -196,7 +197,7 @@ def test_a_robot_without_randomisation_cannot_be_played_with_one(
         playing.play(config_of(f"run.dir={run.root}", "randomize=on"))
 
 
-def test_without_a_walking_test_it_is_said_why(monkeypatch: pytest.MonkeyPatch):
+def test_without_a_walking_test_the_reason_is_named(monkeypatch: pytest.MonkeyPatch):
     env = EnvConfig(suite="playground", name="go1", episode_length=None)
     monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
     assert "walking_envs=8" in playing.walking_lines(config_of(), None)

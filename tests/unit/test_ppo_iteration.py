@@ -202,16 +202,16 @@ def test_exchanges_in_the_program_change_nothing_but_its_place(
     with _all_reduce(strategy, size) as all_reduce:
         step = all_reduce.program(functools.partial(iterate, ENV, learner))
         results = []
-        told_s = 0.0
+        reported_s = 0.0
         for iteration in (alone, _compiled(step, learner)):
             state, envs = _start(learner)
             for _ in range(3):
                 state, envs, metrics = iteration(state, envs)
-                # Each tells what is through by then, which may be two iterations or none.
-                told_s += step.exchange_s or 0.0
+                # Each reports what is finished by then, which may be two iterations or none.
+                reported_s += step.exchange_s or 0.0
             iteration.wait()
             results.append((state.params, state.obs_moments, envs.env.obs, metrics))
-        assert told_s > 0
+        assert reported_s > 0
     _close(*results, atol=1e-4)
 
 
@@ -326,9 +326,9 @@ def test_no_learning_rate_is_lost_and_no_number_is_written_twice(config, alone) 
     step = SingleRankCommunicator().program(functools.partial(iterate, ENV, mine))
     # The first update has not moved yet, the others each lower the rate.
     rates = [1e-3 / 1.5**k for k in range(4)]
-    _, _, told = _compiled(step, mine)(*_start(mine))
-    assert float(told.figures["policy/learning_rate"]) == pytest.approx(rates[-1])
-    assert {k: float(v) for k, v in told.rates.items()} == pytest.approx(
+    _, _, report = _compiled(step, mine)(*_start(mine))
+    assert float(report.figures["policy/learning_rate"]) == pytest.approx(rates[-1])
+    assert {k: float(v) for k, v in report.rates.items()} == pytest.approx(
         {"mean": np.mean(rates), "min": rates[-1], "max": rates[0]}
     )
     _check_no_number_is_written_twice(step)

@@ -66,7 +66,7 @@ def test_another_device_task_or_version_has_a_file_of_its_own(tmp_path: Path):
         '{"profiles": {"search 4x2048 jax": 7}}',
     ],
 )
-def test_a_broken_file_is_moved_aside_and_told(content: str, tmp_path: Path):
+def test_a_broken_file_is_moved_aside_and_reported(content: str, tmp_path: Path):
     path = store(tmp_path)[0].path
     path.write_text(content)
     broken, notes = store(tmp_path)

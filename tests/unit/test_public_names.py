@@ -26,7 +26,7 @@ def test_a_function_stays_what_it_is_when_the_command_of_its_name_is_imported() 
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda: gmijax.train("env=ant"), "config='env=ant': expected a TrainConfig; gmijax.comp"),
         (lambda: gmijax.search(None), "config=None: expected a TrainConfig"),
@@ -39,9 +39,9 @@ def test_a_function_stays_what_it_is_when_the_command_of_its_name_is_imported() 
     ],
 )
 def test_what_is_of_another_type_is_refused_in_one_line(
-    call: Callable[[], object], said: str
+    call: Callable[[], object], message: str
 ) -> None:
-    with pytest.raises(ConfigError, match=f"^{said}"):
+    with pytest.raises(ConfigError, match=f"^{message}"):
         call()
 
 

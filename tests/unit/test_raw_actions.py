@@ -104,7 +104,7 @@ def test_a_data_set_has_actions_and_their_densities(start) -> None:
     choose = policy_of(learner, deterministic=False)
     action, density = choose(tuple(weights[:2]), envs.env.obs, keys)
     assert float(jnp.max(jnp.abs(action))) <= 1.0
-    # By the change of variables, where a float32 still tells the action from its limit.
+    # By the change of variables, where a float32 still differs from the limit.
     inner = np.abs(np.asarray(action)[:, 0]) < 0.99
     assert inner.any()
     output = learner.networks.output(state.params, normalize(weights.moments, envs.env.obs))

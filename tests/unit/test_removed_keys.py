@@ -44,9 +44,7 @@ def _run_with(folder: Path, key: str, value: Any) -> RunPaths:
         ("serve", "output.compress=true"),
     ],
 )
-def test_a_command_line_with_a_removed_key_is_told_what_to_write_now(
-    command: str, text: str
-) -> None:
+def test_the_error_of_a_removed_key_has_what_to_write_now(command: str, text: str) -> None:
     key = text.strip("+~").partition("=")[0]
     policy = ["policy=random"] if command == "serve" else []
     with pytest.raises(ConfigError) as error:
@@ -72,7 +70,9 @@ def test_a_run_that_was_trained_otherwise_is_refused_by_the_key(key: str, tmp_pa
         compose(f"run.resume={run.root}")
 
 
-def test_a_run_of_sac_with_an_agent_of_its_own_is_told_what_to_write(tmp_path: Path) -> None:
+def test_the_error_of_a_run_of_sac_with_an_agent_of_its_own_has_what_to_write(
+    tmp_path: Path,
+) -> None:
     run, key = RunPaths(tmp_path / "old"), "plan.serving_gmis_per_gpu"
     save(run, 100)
     saved = to_dict(compose("env=ant", "algo=sac", "num_envs=1024"))

@@ -27,8 +27,8 @@ Act = Callable[[StopSignals], None]
 
 
 def error(kind: str = "ValueError", *, iteration: int = 3, line: int = 5) -> GmiFailed:
-    said = ReportedError(kind, "off", TRACE.format(line=line, address=iteration * 7919))
-    return GmiFailed(1, f"exit code 1: {kind}: off", iteration=iteration, error=said)
+    reported = ReportedError(kind, "off", TRACE.format(line=line, address=iteration * 7919))
+    return GmiFailed(1, f"exit code 1: {kind}: off", iteration=iteration, error=reported)
 
 
 def killed() -> GmiFailed:
@@ -123,10 +123,10 @@ def test_a_job_whose_checkpoints_are_all_broken_starts_at_its_origin(job: Job, r
     assert job.started_from == [50, 100, 50]
 
 
-def test_what_cannot_be_had_again_is_told_with_the_fault(job: Job):
+def test_a_backend_that_cannot_start_again_is_named_with_the_fault(job: Job):
     gone = BackendUnavailable("the daemon does not answer")
-    said = job.gives_up(job.dies(), job.dies(why=gone))
-    assert "cannot start again: the daemon does not answer" in said
+    message = job.gives_up(job.dies(), job.dies(why=gone))
+    assert "cannot start again: the daemon does not answer" in message
 
     def launch_at(checkpoint: Path | None, attempt: int) -> Any:
         raise ConfigError("GPUs [1] of the job are gone")
@@ -148,8 +148,8 @@ def test_what_would_come_again_ends_the_job(job: Job, kind: str):
 
 
 def test_a_full_disk_ends_the_job(job: Job):
-    said = ReportedError("OSError", "[Errno 28] No space left on device: 'metrics.jsonl'", "")
-    full = GmiFailed(0, "exit code 1", iteration=3, error=said)
+    reported = ReportedError("OSError", "[Errno 28] No space left on device: 'metrics.jsonl'", "")
+    full = GmiFailed(0, "exit code 1", iteration=3, error=reported)
     assert "the disk is full" in job.gives_up(job.dies(why=full), fine)
 
 
@@ -164,8 +164,8 @@ def test_a_process_that_ends_itself_at_the_same_iteration_twice_ends_the_job(job
     def ended(code: int, iteration: int = 0) -> GmiFailed:
         return GmiFailed(0, f"exit code {code}", iteration=iteration, exit_code=code)
 
-    said = job.gives_up(*[job.dies(why=ended(1))] * 2, fine)
-    assert "exit code 1 at the same iteration (0) twice" in said
+    message = job.gives_up(*[job.dies(why=ended(1))] * 2, fine)
+    assert "exit code 1 at the same iteration (0) twice" in message
     assert len(job.attempts.restarts) == 1
     for other in (ended(2), ended(1, iteration=4), ended(-6), error(iteration=0)):
         assert why_not_again(other, ended(1)) is None
@@ -300,7 +300,7 @@ def test_a_lost_gpu_shrinks_the_plan(
         (("run.elastic=true", "plan.gpus=[1]"), r"GPUs \[0\] .* gone, and no other one is left"),
     ],
 )
-def test_what_cannot_go_on_is_told(overrides: tuple[str, ...], message: str):
+def test_jobs_that_cannot_go_on_are_refused(overrides: tuple[str, ...], message: str):
     config = compose("env=ant", "plan.backend=share", *overrides)
     with pytest.raises(ConfigError, match=message):
         with_gpus_left(config, training_plan(config, FOUR), LEFT)

@@ -58,8 +58,11 @@ def test_a_run_that_trains_has_its_first_checkpoint_still_to_come(
     write_json(run.config, {**config, "run": {**config["run"], "checkpoint_every": every}})
     later = f"still training, no checkpoint yet; the first is saved {when}"
     with locked(run.lock, "new"):
-        for named, said in (("last", "run.dir=last: runs/new: "), ("runs/new", "=runs/new: ")):
-            with pytest.raises(NoCheckpointYet, match=re.escape(f"{said}{later}")):
+        for named, beginning in (
+            ("last", "run.dir=last: runs/new: "),
+            ("runs/new", "=runs/new: "),
+        ):
+            with pytest.raises(NoCheckpointYet, match=re.escape(f"{beginning}{later}")):
                 find_checkpoint(named, "run.dir")
         make_run(Path("runs") / "old", 100)
         assert last_run("run.dir").name == "old"
@@ -91,7 +94,7 @@ def test_last_is_the_run_with_the_newest_checkpoint(
     assert last_run("run.dir") == new.root
 
 
-def test_what_last_passes_over_is_said_if_it_is_newer(
+def test_what_last_passes_over_is_named_if_it_is_newer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -104,7 +107,7 @@ def test_what_last_passes_over_is_said_if_it_is_newer(
         os.utime(run.config, (when_s, when_s))
         return run
 
-    def said() -> tuple[str, ...]:
+    def passed_over() -> tuple[str, ...]:
         return choose_checkpoint("last", "run.resume")[1]
 
     chosen = make_run(runs / "chosen", 100)
@@ -112,16 +115,16 @@ def test_what_last_passes_over_is_said_if_it_is_newer(
     begun("older", 1e9)
     begun("served", 3e9, {"policy": "random"})
     (runs / "note").mkdir()
-    assert said() == ()
+    assert passed_over() == ()
     begun("stopped", 3e9)
     job = make_run(runs / "swept" / "000", 50)
     os.utime(job.checkpoint(50) / META, (1e9, 1e9))
     none = "runs/stopped (no checkpoint)"
-    assert said() == (f"last is runs/chosen; newer, but passed over: {none}",)
+    assert passed_over() == (f"last is runs/chosen; newer, but passed over: {none}",)
     os.utime(job.checkpoint(50) / META, (3e9, 3e9))
     swept = "runs/swept (a sweep; its newest run: runs/swept/000)"
-    assert said() == (f"last is runs/chosen; newer, but passed over: {none}, {swept}",)
-    # Who names a run, means it.
+    assert passed_over() == (f"last is runs/chosen; newer, but passed over: {none}, {swept}",)
+    # A run that is named is taken without a note.
     assert choose_checkpoint("runs/chosen", "run.resume")[1] == ()
 
 
@@ -138,8 +141,8 @@ def test_what_last_passes_over_is_said_if_it_is_newer(
 def test_a_checkpoint_with_broken_meta_data_is_passed_over(run: RunPaths, text: str):
     (run.checkpoint(2000) / META).write_text(text, errors="surrogateescape")
     assert find_checkpoint(str(run.root), "run.resume") == run.checkpoint(100)
-    [said] = newest_checkpoint(run.root).passed_over
-    assert re.search(r"/000000002000: passed over, broken meta\.json \(.+\)$", said)
+    [message] = newest_checkpoint(run.root).passed_over
+    assert re.search(r"/000000002000: passed over, broken meta\.json \(.+\)$", message)
     with pytest.raises(ConfigError, match=r"^run\.resume=.*: broken meta\.json \(.+\)$"):
         find_checkpoint(str(run.checkpoint(2000)), "run.resume")
     with pytest.raises(ConfigError, match=r"000000002000: broken meta\.json \(.+\)$"):
@@ -215,8 +218,8 @@ def test_keys_that_are_no_more_stop_a_training_and_no_policy(run: RunPaths):
         "can be played, exported and served as it is)"
     )
     assert trained_config(run.checkpoint(100)) == known
-    said = "left out, because this version does not know them: env.gone, algo.gone, lost"
-    assert left_out(run.checkpoint(100)) == said
+    message = "left out, because this version does not know them: env.gone, algo.gone, lost"
+    assert left_out(run.checkpoint(100)) == message
     assert compose(f"run.dir={run.root}", command="serve").env == known[0]
 
 
@@ -285,8 +288,11 @@ def test_a_leaf_that_the_run_did_not_randomize_stays_as_it_is(run: RunPaths):
 
 def test_a_misspelt_run_folder_is_answered_with_the_one_beside_it(tmp_path: Path):
     make_run(tmp_path / "tiny", 100)
-    for name, said in (("tinny", r"no such folder; did you mean .*tiny\?$"), ("x" * 9, "folder$")):
-        with pytest.raises(ConfigError, match=said):
+    for name, message in (
+        ("tinny", r"no such folder; did you mean .*tiny\?$"),
+        ("x" * 9, "folder$"),
+    ):
+        with pytest.raises(ConfigError, match=message):
             find_checkpoint(str(tmp_path / name), "run.dir")
 
 

@@ -41,7 +41,7 @@ def playground(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def refused(*overrides: str) -> str:
-    """What is said of a command line that is refused."""
+    """The error of a command line that is refused."""
     with pytest.raises(ConfigError) as error:
         require_env(gmijax.compose(*overrides).env)
     return str(error.value)
@@ -76,7 +76,7 @@ def test_names_of_playground_stay() -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "message"),
     [
         ("env.rewards.torqes=0", "unknown key env.rewards.torqes: did you mean torques?"),
         ("+env.rewards.torqes=1", "unknown key env.rewards.torqes: did you mean torques?"),
@@ -107,18 +107,18 @@ def test_names_of_playground_stay() -> None:
         ("seed=0", "env=g1: MENAGERIE_ROOT=/nowhere has no model unitree_g1 (docs/tasks.md)"),
     ],
 )
-def test_what_a_robot_cannot_have_is_one_line(overrides: str, said: str) -> None:
-    assert refused("env=g1", overrides).startswith(said)
+def test_what_a_robot_cannot_have_is_one_line(overrides: str, message: str) -> None:
+    assert refused("env=g1", overrides).startswith(message)
 
 
 def test_a_robot_by_its_long_name_has_no_other_terms() -> None:
-    said = refused("env=playground", "env.name=Go1JoystickFlatTerrain", "env.rewards.torqes=1")
-    assert said == "unknown key env.rewards.torqes: did you mean torques?"
+    message = refused("env=playground", "env.name=Go1JoystickFlatTerrain", "env.rewards.torqes=1")
+    assert message == "unknown key env.rewards.torqes: did you mean torques?"
 
 
 def test_commands_of_go1_have_no_negative_amplitude() -> None:
-    said = "env.settings.command_yaw_rad_per_s=-1.0: must be at least 0"
-    assert refused("env=go1", "env.settings.command_yaw_rad_per_s=-1") == said
+    message = "env.settings.command_yaw_rad_per_s=-1.0: must be at least 0"
+    assert refused("env=go1", "env.settings.command_yaw_rad_per_s=-1") == message
 
 
 @pytest.mark.parametrize("name", ["spot", "playground env.name=CartpoleBalance"])
@@ -137,7 +137,7 @@ def test_where_playground_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> N
     )
 
 
-def test_a_model_that_is_missing_is_said_with_the_line_that_gets_it(
+def test_the_error_of_a_missing_model_has_the_command_that_gets_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.delenv("MENAGERIE_ROOT")
@@ -148,13 +148,13 @@ def test_a_model_that_is_missing_is_said_with_the_line_that_gets_it(
     )
     menagerie.__dict__.update(Cache=lambda: cache, names=lambda: ["unitree_go1"], get=str)
     monkeypatch.setitem(sys.modules, PACKAGE, menagerie)
-    said = (
+    message = (
         "env=go1: the model of unitree_go1 is not here; get with: mujoco-menagerie prefetch "
         "unitree_go1 (without internet: docs/tasks.md)"
     )
-    assert refused("env=go1") == said
+    assert refused("env=go1") == message
     folder = make_model(tmp_path, "unitree_go1")
-    assert refused("env=go1") == said, "half of a download"
+    assert refused("env=go1") == message, "half of a download"
     (folder / ".complete").touch()
     require_env(gmijax.compose("env=go1").env)
 

@@ -106,7 +106,7 @@ def test_progress_is_a_whole_number(step: Any) -> None:
         Talk(1).progress(np.int64(1))
 
 
-def test_roles_talk_only_in_a_gmi() -> None:
+def test_roles_communicate_only_in_a_gmi() -> None:
     with pytest.raises(ConfigError, match=r"^send: only inside a GMI"):
         Talk(1).send(1, 0)
     with pytest.raises(ConfigError, match=r"^rank: only inside a GMI"):

@@ -19,7 +19,7 @@ def envs() -> Any:
     return to_rsl_rl.make(point_mass_env(LENGTH), NUM_ENVS)
 
 
-def test_time_outs_are_told(envs: Any):
+def test_time_outs_are_reported(envs: Any):
     start, _ = envs.reset(seed=0)
     assert start["policy"].shape == (NUM_ENVS, 2)
     for step in range(1, LENGTH + 1):

@@ -31,7 +31,7 @@ def envs(bridge: Any) -> Any:
     return bridge.make(point_mass_env(LENGTH), NUM_ENVS)
 
 
-def test_the_end_of_an_episode_is_told_as_a_monitor_does(envs: Any):
+def test_the_end_of_an_episode_is_reported_as_by_a_monitor(envs: Any):
     envs.seed(3)
     start = envs.reset()
     total = np.zeros(NUM_ENVS)

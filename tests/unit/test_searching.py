@@ -77,20 +77,20 @@ def wanted(*overrides: str) -> TrainConfig:
 
 
 def found(*overrides: str, here: Machine | None = None) -> tuple[SearchResult, str]:
-    said = io.StringIO()
-    console = Console(file=said, width=400, markup=False)
+    output = io.StringIO()
+    console = Console(file=output, width=400, markup=False)
     result = Search(SynchronousWorkload(wanted(*overrides)), here or machine(0), console).result()
-    return result, said.getvalue()
+    return result, output.getvalue()
 
 
 def test_a_second_search_profiles_nothing(profiles: Use, monkeypatch: pytest.MonkeyPatch):
     first = profiles(scaling)
     monkeypatch.setattr(tuner, "draw", draw)
-    result, said = found()
+    result, output = found()
     assert (result.gmis_per_gpu, result.num_envs, result.impl) == (4, 128, "jax")
     assert len(first.asked) == 4
     assert result.run_dir
-    assert result.reason in said
+    assert result.reason in output
     assert "3.60 times the best with one GMI" in result.reason
     report = json.loads((result.run_dir / "search.json").read_text())
     assert report["best"] == {
@@ -102,10 +102,10 @@ def test_a_second_search_profiles_nothing(profiles: Use, monkeypatch: pytest.Mon
     assert (report["complete"], report["num_profiled"]) == (True, 4)
     assert (result.run_dir / "search.png").stat().st_size > 1000
     compiles = "every profile is a short job of its own, which compiles its programs first; "
-    assert said.count(compiles) == 1
+    assert output.count(compiles) == 1
     again = profiles(scaling)
-    second, said = found()
-    assert (again.asked, said.count(compiles)) == ([], 0)
+    second, output = found()
+    assert (again.asked, output.count(compiles)) == ([], 0)
     assert second[1:5] == result[1:5]
     assert second.run_dir is None
 
@@ -127,30 +127,30 @@ def test_an_interrupted_search_goes_on_where_it_was(profiles: Use):
     assert result.num_envs == 128
 
 
-def test_what_cannot_run_is_told_and_remembered(profiles: Use):
+def test_what_cannot_run_is_reported_and_remembered(profiles: Use):
     reason = "cannot run on layout [[0,1]]: see [/tmp/x]"  # It may look like markup.
 
     def small(point: Point) -> Measured | NotRunnable:
         return NotRunnable(reason) if point.gmis_per_gpu == 4 else scaling(point)
 
     profiles(small)
-    result, said = found()
+    result, output = found()
     assert result.gmis_per_gpu == 2
-    assert f"4 x 128, jax: not runnable: {reason}" in said
-    assert said.count(reason) == 2  # When it is profiled, and in the table.
+    assert f"4 x 128, jax: not runnable: {reason}" in output
+    assert output.count(reason) == 2  # When it is profiled, and in the table.
     assert profiles(scaling).asked == []
     assert found()[0].gmis_per_gpu == 2
 
 
-def test_points_for_which_the_host_is_too_small_are_told_and_not_started(
+def test_points_for_which_the_host_is_too_small_are_reported_and_not_started(
     profiles: Use,
 ):
     few = machine(0, host=HostLimits(memory_mib=1500))
     asked = profiles(scaling)
-    result, said = found(here=few)
+    result, output = found(here=few)
     assert result.gmis_per_gpu == 2
     assert all(point.gmis_per_gpu < 4 for point in asked.asked)
-    assert "4 x 128, jax: not runnable: plan.gmis_per_gpu=4: 4 GMIs on this" in said
+    assert "4 x 128, jax: not runnable: plan.gmis_per_gpu=4: 4 GMIs on this" in output
     # With more room they are measured: they were not remembered as what cannot run.
     again = profiles(scaling)
     assert found()[0].gmis_per_gpu == 4
@@ -256,7 +256,7 @@ def test_what_is_given_is_not_searched(profiles: Use):
     assert asked == [Point(2, 96, "jax")]
 
 
-def test_one_gmi_is_said_plainly(profiles: Use):
+def test_an_answer_of_one_gmi_is_worded_plainly(profiles: Use):
     profiles(lambda point: Measured(1e6 / point.gmis_per_gpu, 100.0 + point.num_envs, 0.1))
     result, _ = found()
     assert (result.gmis_per_gpu, result.num_envs) == (1, 64)

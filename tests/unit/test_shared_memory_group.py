@@ -93,8 +93,8 @@ def test_a_gathered_result_belongs_to_the_caller(alone: SharedMemoryGroup) -> No
     np.testing.assert_array_equal(gathered, np.full((1, 3), 2.0))
 
 
-def told(ranks: Sequence[SharedMemoryGroup], *sizes: int) -> list[str]:
-    """What ranks say that take means of different sizes."""
+def errors_of(ranks: Sequence[SharedMemoryGroup], *sizes: int) -> list[str]:
+    """The errors of ranks that take means of different sizes."""
 
     def mean(rank: SharedMemoryGroup, size: int) -> str:
         with pytest.raises(CollectiveError) as caught:
@@ -107,20 +107,20 @@ def told(ranks: Sequence[SharedMemoryGroup], *sizes: int) -> list[str]:
 
 def test_ranks_with_different_lengths_name_both() -> None:
     fit = "do not fit together: num_floats is"
-    assert told(host_ranks(5000, 200_000), 10, 10) == [
+    assert errors_of(host_ranks(5000, 200_000), 10, 10) == [
         f"GMI 0 and GMI 1 {fit} 5000 for GMI 0, and 200000 for GMI 1",
         f"GMI 1 and GMI 0 {fit} 200000 for GMI 1, and 5000 for GMI 0",
     ]
 
 
 def test_ranks_are_named_by_the_ids_of_their_gmis() -> None:
-    assert told(host_ranks(10, 10, ids=(4, 6)), 8, 9) == [
+    assert errors_of(host_ranks(10, 10, ids=(4, 6)), 8, 9) == [
         "step 1: GMI 4 calls sum of 8 floats, GMI 6 calls sum of 9 floats",
         "step 1: GMI 6 calls sum of 9 floats, GMI 4 calls sum of 8 floats",
     ]
-    for said in told(host_ranks(10, 20, ids=(4, 6)), 8, 8):
-        assert "GMI 4" in said
-        assert "GMI 6" in said
+    for message in errors_of(host_ranks(10, 20, ids=(4, 6)), 8, 8):
+        assert "GMI 4" in message
+        assert "GMI 6" in message
 
 
 def test_a_rank_that_has_closed_is_lost_to_those_who_still_call() -> None:

@@ -211,11 +211,11 @@ def test_the_demo_plays_and_says_what_it_is(
     shown: list[float | None], capsys: pytest.CaptureFixture[str]
 ):
     assert main(["demo"]) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("ball_balance: a policy that gmijax trained for 1,000 env steps\n")
-    assert "episodes in MuJoCo: return " in said
-    assert re.search(r"  gmijax (play|view) env=ball_balance checkpoint=shipped\n", said)
-    assert said.endswith("Next: train ball_balance yourself\n  gmijax train env=ball_balance\n")
+    output = capsys.readouterr().out
+    assert output.startswith("ball_balance: a policy that gmijax trained for 1,000 env steps\n")
+    assert "episodes in MuJoCo: return " in output
+    assert re.search(r"  gmijax (play|view) env=ball_balance checkpoint=shipped\n", output)
+    assert output.endswith("Next: train ball_balance yourself\n  gmijax train env=ball_balance\n")
     trajectory = load_trajectory(Path("runs/shipped/ball_balance/trajectory.npz"))
     assert trajectory.lines[-1] == "$ gmijax demo env=ball_balance"
     assert shown == [demo.FILM_S]

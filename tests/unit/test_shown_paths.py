@@ -72,7 +72,7 @@ def listed(run: RunPaths) -> object:
 
 
 @pytest.mark.parametrize(
-    ("ask", "said"),
+    ("ask", "message"),
     [
         (lambda run: read_json(run.plan), "td/plan.json: cannot be read (No such file"),
         (alone, "checkpoint td/checkpoints/000000000100: no config.json in td; "),
@@ -97,11 +97,11 @@ def listed(run: RunPaths) -> object:
     ],
 )
 def test_a_file_below_the_working_directory_is_named_from_there(
-    run: RunPaths, ask: Callable[[RunPaths], object], said: str
+    run: RunPaths, ask: Callable[[RunPaths], object], message: str
 ) -> None:
     with pytest.raises(ConfigError) as error:
         ask(run)
-    assert str(error.value).startswith(said)
+    assert str(error.value).startswith(message)
 
 
 def test_a_file_elsewhere_is_named_whole(run: RunPaths, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,12 +127,12 @@ def test_of_damaged_checkpoints_the_newest_is_named_and_the_others_are_counted(
     assert found.passed_over[0].startswith("checkpoint td/checkpoints/000000000300: passed over,")
     with pytest.raises(ConfigError) as error:
         find_checkpoint("td", "run.dir")
-    said = str(error.value)
-    assert said == f"run.dir=td: {none_is_whole(found)}"
-    assert said.startswith("run.dir=td: no checkpoint is whole: td/checkpoints/000000000300: ")
-    assert said.endswith(" (and 2 more)")
-    assert said.count("broken") == 1
-    assert said.count("checkpoints/") == 1
+    message = str(error.value)
+    assert message == f"run.dir=td: {none_is_whole(found)}"
+    assert message.startswith("run.dir=td: no checkpoint is whole: td/checkpoints/000000000300: ")
+    assert message.endswith(" (and 2 more)")
+    assert message.count("broken") == 1
+    assert message.count("checkpoints/") == 1
 
 
 def test_a_program_of_the_working_directory_is_none_of_path(run: RunPaths) -> None:

@@ -128,7 +128,7 @@ def test_servos_hold_the_standing_pose(model):
 
 
 def glide(sim, model, state, ctrl, read):
-    """In place of physics: the base gets faster by what the first joint is told."""
+    """In place of physics: the base gets faster by the control of the first joint."""
     faster = state._replace(qvel=state.qvel.at[0].add(ctrl[0]))
     return faster, (jnp.zeros(anymal.ACTION_SIZE), HIGH_KNEES)
 

@@ -96,7 +96,7 @@ def test_whether_an_open_drawer_terminates_is_no_share():
         FrankaCabinetSettings(open_terminates=0.5)
 
 
-def test_a_finger_behind_the_handle_is_told_from_one_at_it():
+def test_a_finger_behind_the_handle_differs_from_one_at_it():
     at_handle = pose()
     for finger in (0, 1):
         for depth_m, behind in ((0.039, False), (0.041, True)):

@@ -102,8 +102,8 @@ def test_what_only_the_value_function_sees_has_no_past():
 
 def test_the_configuration_puts_both_around_a_task(tmp_path: Path):
     (tmp_path / "point.py").write_text(POINT_TASK)
-    told = (f"env={tmp_path}/point.py:make", "env.history=3", "env.action_repeat=2")
-    env = make_envs(compose(*told).env, "jax", seed=0, first_env=0, num_envs=2)
+    overrides = (f"env={tmp_path}/point.py:make", "env.history=3", "env.action_repeat=2")
+    env = make_envs(compose(*overrides).env, "jax", seed=0, first_env=0, num_envs=2)
     assert env.spec.obs_size == 6
     assert env.spec.control_dt_s == pytest.approx(0.2)
     assert env.spec.episode_length == 10

@@ -155,7 +155,7 @@ def test_poses_are_those_of_mujoco_in_c(impl: str):
 
 
 @pytest.mark.parametrize("impl", ["jax", "warp"])
-def test_a_model_that_an_implementation_refuses_is_told_in_one_line(impl: str):
+def test_a_model_that_an_implementation_refuses_is_an_error_of_one_line(impl: str):
     if impl == "warp":
         pytest.importorskip("warp")
     # 70 degrees of freedom with dense matrices: too many for MJX-Warp. MJX-JAX takes the second
@@ -163,8 +163,8 @@ def test_a_model_that_an_implementation_refuses_is_told_in_one_line(impl: str):
     balls = "<body><freejoint/><geom size='0.1' condim='1'/></body>" * 12
     option = "jacobian='dense'" if impl == "warp" else "cone='elliptic'"
     text = f"<mujoco model='balls'><option {option}/><worldbody>{balls}</worldbody></mujoco>"
-    said = rf"^physics\.impl={impl}: .+ cannot simulate the model balls: .+"
-    with pytest.raises(ConfigError, match=said) as error:
+    message = rf"^physics\.impl={impl}: .+ cannot simulate the model balls: .+"
+    with pytest.raises(ConfigError, match=message) as error:
         from_mj_model(mujoco.MjModel.from_xml_string(text), impl=impl, substeps=1, max_envs=1)
     assert "\n" not in str(error.value)
 

@@ -99,7 +99,7 @@ def env() -> Env:
     return sledge()
 
 
-def test_mujoco_warp_is_told_of_all_that_is_drawn(env: Env):
+def test_mujoco_warp_gets_all_fields_that_are_drawn(env: Env):
     assert {leaf.removeprefix(".") for leaf in drawn(env)} <= set(MODEL_LEAVES)
 
 
@@ -244,7 +244,7 @@ def test_every_episode_may_have_a_model_of_its_own(env: Env, monkeypatch: pytest
 
 
 @pytest.mark.parametrize(
-    ("ranges", "said"),
+    ("ranges", "message"),
     [
         ({"body_mas": (0.5, 2)}, r"env.randomization.body_mas: .*: did you mean body_mass\?"),
         ({"body_mass": (2, 1)}, r"body_mass.range=\[2.0, 1.0\]: expected \[lowest, highest\]"),
@@ -255,15 +255,15 @@ def test_every_episode_may_have_a_model_of_its_own(env: Env, monkeypatch: pytest
         ({"body_mass": (float("nan"), 1)}, "expected a list of numbers|expected a finite number"),
     ],
 )
-def test_ranges_that_are_refused_before_anything_starts(ranges: dict[str, Any], said: str):
+def test_ranges_that_are_refused_before_anything_starts(ranges: dict[str, Any], message: str):
     data = {leaf: {"operation": "scale", "range": list(r)} for leaf, r in ranges.items()}
-    with pytest.raises(ConfigError, match=said) as error:
+    with pytest.raises(ConfigError, match=message) as error:
         from_dict(EnvConfig, {"name": "ant", "episode_length": 9, "randomization": data}, "env.")
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("leaf", "operation", "low", "names", "said"),
+    ("leaf", "operation", "low", "names", "message"),
     [
         ("body_mass", "scale", 1.0, ("torso",), "names=torso: sledge has no such name; allowed"),
         ("body_mass", "scale", 1.0, ("frame",), "nothing but zeros there"),
@@ -275,10 +275,10 @@ def test_ranges_that_are_refused_before_anything_starts(ranges: dict[str, Any], 
     ],
 )
 def test_what_the_model_cannot_have_is_refused(
-    env: Env, leaf: str, operation: Any, low: float, names: tuple[str, ...] | None, said: str
+    env: Env, leaf: str, operation: Any, low: float, names: tuple[str, ...] | None, message: str
 ):
     ranges = {leaf: LeafRange(operation=operation, range=(low, low + 1), names=names)}
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         randomized(env, ranges, seed=0, first_env=0, num_envs=2)
 
 

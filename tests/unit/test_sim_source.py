@@ -93,9 +93,9 @@ def test_a_task_gets_the_weights_and_settings_that_it_takes(tmp_path: Path):
 def test_a_curriculum_needs_a_task_that_carries_something_on(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"^env\.curriculum: .* no argument `curriculum` to"):
         make_env(written(tmp_path, TASK), curriculum=True)
-    deaf = TASK.replace("impl, max_envs", "impl, max_envs, curriculum=False")
+    without_curriculum = TASK.replace("impl, max_envs", "impl, max_envs, curriculum=False")
     with pytest.raises(ConfigError, match=r"^env\.curriculum=on: point has no next_episode"):
-        make_env(written(tmp_path, deaf), curriculum=True)
+        make_env(written(tmp_path, without_curriculum), curriculum=True)
 
 
 def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -152,7 +152,7 @@ def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pyte
         ("state: state.physics)", "state: state.physics[0])", r"qpos has shape \(\), not a vect"),
     ],
 )
-def test_what_is_wrong_with_a_task_is_told_in_one_line(
+def test_what_is_wrong_with_a_task_is_an_error_of_one_line(
     tmp_path: Path, old: str, new: str, message: str
 ):
     assert TASK.count(old) >= 1

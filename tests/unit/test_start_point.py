@@ -86,10 +86,10 @@ def test_a_run_that_is_complete_says_what_differs_and_what_is_damaged(
     (save(run, 200) / META).write_text("{")
     write_json(run.summary, {"status": "completed"})
     gmijax.train(config_of(run.root, "num_timesteps=100", "num_envs=8"), show=True)
-    said = " ".join(capsys.readouterr().out.split())
-    assert "000000000200: passed over" in said
-    assert "changed since the run: num_envs is 8, was" in said
-    assert said.index("num_envs is 8") < said.index("this run is complete already")
+    output = " ".join(capsys.readouterr().out.split())
+    assert "000000000200: passed over" in output
+    assert "changed since the run: num_envs is 8, was" in output
+    assert output.index("num_envs is 8") < output.index("this run is complete already")
 
 
 @pytest.mark.parametrize("named", ["run.name=5", "run.dir=runs/5", "run.name='5'"])
@@ -105,7 +105,7 @@ def test_a_run_whose_name_is_a_number_keeps_its_settings(
 
 
 @pytest.mark.parametrize(
-    ("left", "said"),
+    ("left", "message"),
     [
         ("config.json", "the run folder exists already; run.resume=auto continues in it"),
         ("thesis.tex", "is not a run folder, and is not empty"),
@@ -116,14 +116,19 @@ def test_a_run_whose_name_is_a_number_keeps_its_settings(
     [("run.name=5", "run.name=5 (runs/5)"), ("run.dir=runs/5", "run.dir=runs/5")],
 )
 def test_a_folder_that_is_refused_is_named_as_it_was_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: str, said: str, named: str, shown: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    left: str,
+    message: str,
+    named: str,
+    shown: str,
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs" / "5").mkdir(parents=True)
     (tmp_path / "runs" / "5" / left).touch()
     with pytest.raises(ConfigError) as error:
         find_start_point(compose("env=ant", named))
-    assert str(error.value) == f"{shown}: {said}"
+    assert str(error.value) == f"{shown}: {message}"
 
 
 @pytest.mark.parametrize("damage", ["cut", "missing"])
@@ -248,7 +253,7 @@ def test_a_saved_replay_has_to_fit_only_where_it_is_gone_on_with(tmp_path: Path)
     assert line.startswith("replay of 524,288 transitions (MiB")
 
 
-def test_what_is_no_run_folder_is_not_said_to_be_one(tmp_path: Path):
+def test_a_folder_that_is_no_run_folder_is_not_called_one(tmp_path: Path):
     docs = tmp_path / "docs"
     docs.mkdir()
     with pytest.raises(ConfigError, match=r"already; run\.resume=auto continues in it$"):
@@ -270,12 +275,12 @@ def test_auto_leaves_a_folder_with_something_else_alone(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [("thesis.tex", "thesis.tex: is not a folder$"), ("a" * 300, r"\(File name too long\)$")],
 )
-def test_a_sweep_goes_on_in_a_folder_only(tmp_path: Path, name: str, said: str):
+def test_a_sweep_goes_on_in_a_folder_only(tmp_path: Path, name: str, message: str):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(ConfigError, match=rf"^run\.dir=.*{said}"):
+    with pytest.raises(ConfigError, match=rf"^run\.dir=.*{message}"):
         gmijax.sweep([compose("env=ant", f"run.dir={tmp_path / name}")])
 
 
@@ -381,7 +386,7 @@ def test_auto_takes_what_the_command_says_and_names_it(run: RunPaths):
         assert str(flatten(to_dict(config))[key]) == value
         [note] = find_start_point(config).notes
         assert note.startswith(f"changed since the run: {key} is {value}, was ")
-    # A file of settings that is chosen is said, too.
+    # The notes name a chosen file of settings, too.
     tuned = config_of(run.root, "tuned=humanoid_ppo")
     notes = find_start_point(tuned).notes
     assert any("algo.gae_lambda" not in note for note in notes)
@@ -436,14 +441,14 @@ def test_a_key_that_a_run_lacks_is_named_with_its_file(
     del saved["algo"]["clip_value_loss"]
     write_json(run.config, saved)
     save(run, 100)
-    said = (
+    message = (
         "^run/config.json: missing key algo.clip_value_loss, as in a run of another version; add "
         "it to that file with the value that the run was trained with "
     )
     again = config_of(run.root, override), compose(f"run.resume={run.root}", override)
     tries = [partial(find_start_point, config) for config in again]
     for use in (*tries, partial(trained_config, run.checkpoint(100))):
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=message):
             use()
 
 

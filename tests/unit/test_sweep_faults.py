@@ -46,7 +46,7 @@ def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("exit_code", "said"),
+    ("exit_code", "reason"),
     [
         (-9, "its controller was killed by SIGKILL"),
         (-11, "its controller was killed by SIGSEGV"),
@@ -54,17 +54,17 @@ def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_job_whose_controller_is_killed_runs_again(
-    exit_code: int, said: str, tmp_path: Path
+    exit_code: int, reason: str, tmp_path: Path
 ) -> None:
     sweep = Sweep(tmp_path, jobs(2))
     sweep.run(lambda: sweep.nodes[0].end(exit_code), sweep.end_all)
     assert sweep.states() == ["completed"] * 2
     (event,) = map(json.loads, sweep.paths.job(0).events.read_text().splitlines())
-    assert event["reason"] == f"again, after {said}"
+    assert event["reason"] == f"again, after {reason}"
     (tmp_path / "once").mkdir()
     once = Sweep(tmp_path / "once", jobs(1, "run.max_restarts=1"))
     once.run(lambda: once.nodes[0].end(exit_code), lambda: once.nodes[0].end(exit_code))
-    assert (once.states(), once.jobs[0].progress.error) == (["failed"], said)
+    assert (once.states(), once.jobs[0].progress.error) == (["failed"], reason)
 
 
 def full(*_: Any, **__: Any) -> Any:
@@ -72,7 +72,7 @@ def full(*_: Any, **__: Any) -> Any:
 
 
 class FullStudy(Study[Job]):
-    """Cannot be written when it is told of a job, or asked about one."""
+    """Cannot be written when a job is added to it, or when it is asked about one."""
 
     tell = full
     is_hopeless = full
@@ -102,15 +102,15 @@ def test_a_sweep_that_cannot_write_asks_running_jobs_to_save(
 
 
 def orders_of(
-    sweep: Sweep, monkeypatch: pytest.MonkeyPatch, deaf_to: Collection[str] = ()
+    sweep: Sweep, monkeypatch: pytest.MonkeyPatch, ignored: Collection[str] = ()
 ) -> list[str]:
-    """What jobs are told from now on; to the orders `deaf_to` they do nothing."""
+    """The orders to jobs from now on; the orders in `ignored` have no effect."""
     orders: list[str] = []
     for node in sweep.nodes:
 
         def order(child: int, do: Any, old: Any = node.order) -> None:
             orders.append(do)
-            if do not in deaf_to:
+            if do not in ignored:
                 old(child, do)
 
         monkeypatch.setattr(node, "order", order)
@@ -118,7 +118,7 @@ def orders_of(
 
 
 @pytest.mark.parametrize(
-    ("numbers", "told"),
+    ("numbers", "expected"),
     [
         ([signal.SIGINT], ["interrupt"]),
         ([signal.SIGTERM], ["ask_to_stop"]),
@@ -127,10 +127,10 @@ def orders_of(
     ],
 )
 def test_jobs_are_asked_once_and_once_more_if_it_becomes_urgent(
-    numbers: list[int], told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    numbers: list[int], expected: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sweep, signals = Sweep(tmp_path, jobs(1)), StopSignals()
-    orders = orders_of(sweep, monkeypatch, deaf_to=("interrupt", "ask_to_stop"))
+    orders = orders_of(sweep, monkeypatch, ignored=("interrupt", "ask_to_stop"))
 
     def wait() -> None: ...
 
@@ -141,7 +141,7 @@ def test_jobs_are_asked_once_and_once_more_if_it_becomes_urgent(
     steps = [part for number in numbers for part in (partial(signals.handle, number), wait)]
     with pytest.raises(JobInterrupted):
         sweep.run(*steps, wait, end, signals=signals)
-    assert orders == [*told, "close"]
+    assert orders == [*expected, "close"]
     assert sweep.states() == ["interrupted"]
 
 
@@ -149,11 +149,11 @@ def test_jobs_are_asked_once_and_once_more_if_it_becomes_urgent(
     ("exit_code", "state"),
     [(-signal.SIGINT, "interrupted"), (-signal.SIGTERM, "interrupted"), (-9, "waiting")],
 )
-def test_a_controller_that_is_asked_before_it_hears_signals_is_interrupted(
+def test_a_controller_that_is_asked_before_it_handles_signals_is_interrupted(
     exit_code: int, state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sweep, signals = Sweep(tmp_path, jobs(1)), StopSignals()
-    orders_of(sweep, monkeypatch, deaf_to=("interrupt", "ask_to_stop"))
+    orders_of(sweep, monkeypatch, ignored=("interrupt", "ask_to_stop"))
     end = partial(sweep.nodes[0].end, exit_code)
     with pytest.raises(JobInterrupted):
         sweep.run(partial(signals.handle, signal.SIGINT), end, signals=signals)
@@ -182,7 +182,7 @@ def test_only_urgent_signals_give_jobs_a_time_to_end(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sweep, signals = Sweep(tmp_path, jobs(1)), StopSignals()
-    orders = orders_of(sweep, monkeypatch, deaf_to=("interrupt", "ask_to_stop"))
+    orders = orders_of(sweep, monkeypatch, ignored=("interrupt", "ask_to_stop"))
     clock_s = [running_s()]
     monkeypatch.setattr("gmijax.sweeps.running.running_s", lambda: clock_s[0])
 
@@ -250,9 +250,9 @@ def test_a_job_that_cannot_be_killed_is_named_and_holds_up_no_other(
             host.order(1, "ask_to_stop")
             host.close()
         assert made[1].look().exit_code == -signal.SIGKILL
-        (said,) = held_jobs.left_behind(of_both, paths, host.left)
-        assert said.startswith(f"job 0: process {pids[0]} (")
-        assert said.endswith(f"still runs in its folder: end it (kill {pids[0]})")
+        (message,) = held_jobs.left_behind(of_both, paths, host.left)
+        assert message.startswith(f"job 0: process {pids[0]} (")
+        assert message.endswith(f"still runs in its folder: end it (kill {pids[0]})")
     finally:
         for child in made:
             child.kill()
@@ -306,7 +306,7 @@ def test_an_order_that_cannot_be_written_is_named(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "cwd", "said"),
+    ("arguments", "cwd", "reason"),
     [
         (("./alien",), None, "./alien: Exec format error"),
         (("./no_x",), None, "./no_x: Permission denied"),
@@ -316,10 +316,10 @@ def test_an_order_that_cannot_be_written_is_named(
         (("true", "x" * 2**20), None, "true: Argument list too long"),
     ],
 )
-def test_what_is_wrong_with_one_command_is_said_and_is_no_error_of_all(
+def test_what_is_wrong_with_one_command_is_named_and_is_no_error_of_all(
     arguments: tuple[str, ...],
     cwd: str | None,
-    said: str,
+    reason: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -331,7 +331,7 @@ def test_what_is_wrong_with_one_command_is_said_and_is_no_error_of_all(
     lock = tmp_path / ".lock"
     with pytest.raises(JobNotStarted) as raised:
         Child(Process("job 003", arguments, tmp_path / "log", cwd=cwd, lock=lock), {})
-    assert str(raised.value) == f"cannot be started ({said})"
+    assert str(raised.value) == f"cannot be started ({reason})"
     assert not is_locked(lock)
     assert set(os.listdir("/proc/self/fd")) <= before
 

@@ -55,8 +55,8 @@ class FakeHost(LocalHost):
         if self.lost is not None:
             raise NodeLost(self.lost)
         assert start.process.input_file is not None
-        order, told = start.process.input_file
-        folders = [Path(config["run"]["dir"]) for config in told["configs"]]
+        order, request = start.process.input_file
+        folders = [Path(config["run"]["dir"]) for config in request["configs"]]
         for folder in folders:
             folder.mkdir(exist_ok=True)
         child = next(self._numbers)
@@ -88,7 +88,7 @@ class FakeHost(LocalHost):
 
 
 class Sweep:
-    """Jobs on two nodes, with two slots each unless told otherwise."""
+    """Jobs on two nodes, with two slots each by default."""
 
     def __init__(self, folder: Path, jobs: Iterable[Job], **settings: Any) -> None:
         self.jobs, self.paths = list(jobs), SweepPaths(folder)

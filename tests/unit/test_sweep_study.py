@@ -18,13 +18,13 @@ from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.progress import State
 from gmijax.sweeps.study import OptunaStudy
 
-SAID: list[str] = []
+MESSAGES: list[str] = []
 
 
 def study(folder: Path, *overrides: str) -> OptunaStudy:
     request = build_sweep(overrides)
     journal = folder / "study.log"
-    return OptunaStudy(request.settings, request.space, request.make_job, journal, SAID.append)
+    return OptunaStudy(request.settings, request.space, request.make_job, journal, MESSAGES.append)
 
 
 TOY = ("sweep.sampler=tpe", "algo.learning_rate=tag(log,interval(1e-5,1e-2))", "sweep.trials=8")
@@ -59,14 +59,14 @@ def test_values_that_are_not_allowed_together_are_left_out_and_the_others_go_on(
     lists = ("num_envs=8,64", "algo.num_minibatches=128,1024")
     drawn = (*lists, "sweep.sampler=random", "sweep.trials=12")
     trials = study(tmp_path, *drawn)
-    SAID.clear()
+    MESSAGES.clear()
     jobs = []
     while job := trials.next():
         jobs.append(job.number)
         trials.tell(end(job, "completed", 1.0))
     assert 0 < len(jobs) < 12
-    assert len(SAID) == 12 - len(jobs)
-    assert all("do not divide into algo.num_minibatches=1024" in line for line in SAID)
+    assert len(MESSAGES) == 12 - len(jobs)
+    assert all("do not divide into algo.num_minibatches=1024" in line for line in MESSAGES)
     again = study(tmp_path, *drawn)
     assert [job.number for job in again.earlier()] == jobs
     assert again.next() is None
@@ -135,10 +135,10 @@ def test_trials_of_half_written_lines_do_not_keep_a_study_from_going_on(tmp_path
     assert set(trial_states(tmp_path)) == {"COMPLETE", "FAIL"}
 
 
-def test_values_of_windows_that_are_not_full_are_told_only_beside_their_like(
+def test_the_study_gets_values_of_partial_windows_only_beside_others_of_such(
     tmp_path: Path,
 ) -> None:
-    def told(*ends: tuple[float, bool], folder: Path) -> list[str]:
+    def states_after(*ends: tuple[float, bool], folder: Path) -> list[str]:
         folder.mkdir()
         trials = study(folder, *TOY, "sweep.pruner=median", "num_timesteps=100")
         for value, is_full in ends:
@@ -151,9 +151,9 @@ def test_values_of_windows_that_are_not_full_are_told_only_beside_their_like(
         return trial_states(folder)
 
     early = [(-6.3, False), (-7.0, False)]
-    assert told(*early, folder=tmp_path / "a") == ["COMPLETE", "COMPLETE"]
+    assert states_after(*early, folder=tmp_path / "a") == ["COMPLETE", "COMPLETE"]
     mixed = [(-137.0, True), (-6.3, False), (-120.0, True)]
-    assert told(*mixed, folder=tmp_path / "b") == ["COMPLETE", "FAIL", "COMPLETE"]
+    assert states_after(*mixed, folder=tmp_path / "b") == ["COMPLETE", "FAIL", "COMPLETE"]
 
 
 @pytest.mark.parametrize("pruner", ["asha", "median"])

@@ -117,12 +117,12 @@ def test_a_job_shows_how_long_it_starts_and_an_eta_once_its_rate_is_steady(
 
 
 def test_without_a_terminal_every_change_is_a_line() -> None:
-    said, jobs = io.StringIO(), running_jobs()
-    with view_on(said, jobs) as view:
+    output, jobs = io.StringIO(), running_jobs()
+    with view_on(output, jobs) as view:
         view.update()
         view.update()
         jobs[0].progress.state, jobs[0].progress.error = "failed", "GMI 0 failed: NonFiniteError"
-    lines = said.getvalue().splitlines()
+    lines = output.getvalue().splitlines()
     assert lines[:2] == [f"job {n} seed={n}: running on GPU 3 slot {n}" for n in range(2)]
     assert lines[2].startswith("job 2 seed=2: completed after 1800 s, return 3.5; 2 running")
     assert lines[3:] == ["job 0 seed=0: failed: GMI 0 failed: NonFiniteError"]
@@ -130,38 +130,38 @@ def test_without_a_terminal_every_change_is_a_line() -> None:
 
 @pytest.mark.parametrize("state", ["completed", "pruned"])
 def test_what_an_earlier_command_has_done_is_no_news(state: Any) -> None:
-    said, (before, now) = io.StringIO(), jobs_of([compose(), compose("seed=1")])
+    output, (before, now) = io.StringIO(), jobs_of([compose(), compose("seed=1")])
     before.progress.state = state
     before.progress.take_summary({"wall_s": 7.0})
-    with view_on(said, [before, now]) as view:
+    with view_on(output, [before, now]) as view:
         view.update()
         now.progress.begin("", None)
         now.progress.state = state
         view.update()
-    (line,) = said.getvalue().splitlines()
+    (line,) = output.getvalue().splitlines()
     assert line.startswith(f"job 1 seed=1: {state} after 0 s; 2 {state}")
 
 
 def test_a_long_command_is_there_once() -> None:
-    said, jobs = io.StringIO(), running_jobs()[:2]
+    output, jobs = io.StringIO(), running_jobs()[:2]
     command = "python train.py --seed 7 " + "--more options " * 20
     jobs[0] = dataclasses.replace(jobs[0], overrides={"command": command})
-    with view_on(said, jobs) as view:
+    with view_on(output, jobs) as view:
         view.update()
         for job in jobs:
             job.progress.state, job.progress.error = "failed", "exit code 3"
-    assert said.getvalue().count("--seed 7") == 1
+    assert output.getvalue().count("--seed 7") == 1
     not_started = io.StringIO()
     with view_on(not_started, jobs):
         pass
     assert not_started.getvalue().count("--seed 7") == 1
-    assert said.getvalue().endswith(
+    assert output.getvalue().endswith(
         "job 0: failed: exit code 3\njob 1 seed=1: failed: exit code 3\n"
     )
 
 
 def test_a_value_of_a_window_that_is_not_full_is_marked_where_it_is_shown() -> None:
-    said, (job,) = io.StringIO(), jobs_of([compose()])
+    output, (job,) = io.StringIO(), jobs_of([compose()])
     early = {"return": 9.0, "window/return": 8.0, "window/episodes": 12, "window/full": 0}
     job.progress.take({"env_steps": 100, **early}, SWEEP)
     terminal = Terminal()
@@ -176,11 +176,11 @@ def test_a_value_of_a_window_that_is_not_full_is_marked_where_it_is_shown() -> N
     assert "s, return 8 so far; " in interrupted.getvalue()
     job.progress.begin("", None)
     job.progress.state = "completed"
-    with view_on(said, [job]) as view:
+    with view_on(output, [job]) as view:
         view.update()
     # Nothing is overridden: there is nothing to say of it.
-    assert said.getvalue().startswith("job 0: completed after ")
-    assert "s, return 8 (12 episodes, too few to compare); " in said.getvalue()
+    assert output.getvalue().startswith("job 0: completed after ")
+    assert "s, return 8 (12 episodes, too few to compare); " in output.getvalue()
 
 
 @pytest.mark.parametrize("what", ["a terminal that is closed", "a row that cannot be made"])
@@ -216,15 +216,15 @@ def test_overrides_and_value_of_a_job_are_there_for_the_hparams_tab(tmp_path: Pa
     values = [(event.step, value) for event in events(path) for value in event.summary.value]
     (scalar,) = [value for step, value in values if value.tag == "hparam/return" and step == 640]
     assert scalar.simple_value == 7.5
-    said = {v.tag.rpartition("/")[2]: v.metadata.plugin_data.content for _, v in values}
+    contents = {v.tag.rpartition("/")[2]: v.metadata.plugin_data.content for _, v in values}
     plugin_data = vars(plugin_hparams_pb2)["HParamsPluginData"]
-    started = plugin_data.FromString(said["session_start_info"]).session_start_info.hparams
+    started = plugin_data.FromString(contents["session_start_info"]).session_start_info.hparams
     assert started["algo.learning_rate"].number_value == 1e-4
     assert started["env"].string_value == "ant"
     assert started["algo.clip_value_loss"].bool_value is True
-    experiment = plugin_data.FromString(said["experiment"]).experiment
+    experiment = plugin_data.FromString(contents["experiment"]).experiment
     assert [info.name.tag for info in experiment.metric_infos] == ["hparam/return"]
-    assert plugin_data.FromString(said["session_end_info"]).HasField("session_end_info")
+    assert plugin_data.FromString(contents["session_end_info"]).HasField("session_end_info")
 
 
 def test_a_value_that_cannot_be_compared_has_a_tag_of_its_own(tmp_path: Path) -> None:
@@ -255,9 +255,9 @@ def test_the_table_hides_nothing_of_an_override() -> None:
     view = SweepView(open_console(show=False), jobs, SWEEP, "{}")
     text = {}
     for width in (80, 120):
-        said = io.StringIO()
-        Console(file=said, width=width).print(view._table())
-        text[width] = said.getvalue()
+        output = io.StringIO()
+        Console(file=output, width=width).print(view._table())
+        text[width] = output.getvalue()
     assert "…" not in text[80]
     assert "slot" not in text[80]
     assert "starting" in text[80]

@@ -80,13 +80,13 @@ def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
     own = ("env=some.py:make", "env.rewards.near=1,2")
     for sweep in (lists, weights, own):
         for job in build_sweep((*sweep, "num_envs=512")).jobs:
-            told = [f"{key}={value}" for key, value in job.overrides.items()]
+            own_overrides = [f"{key}={value}" for key, value in job.overrides.items()]
             fixed = [text for text in sweep if "," not in text]
-            assert job.config == compose(*fixed, *told, "num_envs=512")
+            assert job.config == compose(*fixed, *own_overrides, "num_envs=512")
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "message"),
     [
         (("seed=range(3,3)",), "an empty list"),
         (("seed=1,1",), "a value is repeated"),
@@ -124,10 +124,10 @@ def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
         ),
     ],
 )
-def test_bad_lists_are_refused(overrides: tuple[str, ...], said: str) -> None:
+def test_bad_lists_are_refused(overrides: tuple[str, ...], message: str) -> None:
     with pytest.raises(ConfigError) as raised:
         build_sweep(overrides)
-    assert said in str(raised.value)
+    assert message in str(raised.value)
     assert "\n" not in str(raised.value)
 
 
@@ -153,7 +153,7 @@ def test_configurations_differ_by_what_they_are_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("plan.gpus=[0]", "a sweep chooses the GPUs"),
         ("plan.layout=[[0]]", "plan.layout: a sweep decides it"),
@@ -161,8 +161,8 @@ def test_configurations_differ_by_what_they_are_named() -> None:
         ("plan.gpus=3", "plan.gpus=3: the sweep has 2 GPUs"),
     ],
 )
-def test_jobs_that_place_themselves_are_refused(override: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_jobs_that_place_themselves_are_refused(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         require_placeable(jobs_of([compose(override)]), 2)
 
 
@@ -196,7 +196,7 @@ EVALUATED = LINE | {"eval/return": 1.0, "eval/length": 20.0}
 
 
 @pytest.mark.parametrize(
-    ("line", "objective", "said"),
+    ("line", "objective", "message"),
     [
         (LINE, "metric/distnace", r": did you mean metric/distance\?"),
         (LINE, "metric/speed", r"; allowed: metric/distance"),
@@ -207,9 +207,11 @@ EVALUATED = LINE | {"eval/return": 1.0, "eval/length": 20.0}
     ],
 )
 def test_an_objective_that_no_line_has_is_refused(
-    line: dict[str, Any], objective: str, said: str
+    line: dict[str, Any], objective: str, message: str
 ) -> None:
-    with pytest.raises(ConfigError, match=rf"^sweep\.objective={objective}: not in the.*{said}"):
+    with pytest.raises(
+        ConfigError, match=rf"^sweep\.objective={objective}: not in the.*{message}"
+    ):
         require_logged(line, objective)
 
 
@@ -232,10 +234,12 @@ def test_returns_of_different_rewards_are_warned_of(
     objective: str, overrides: str, warns: bool
 ) -> None:
     jobs = build_sweep(("env=ant", "eval.every=100", f"sweep.objective={objective}", overrides))
-    said = why_not_comparable(jobs.configs, jobs.settings)
-    assert (said is not None) == warns
-    if said:
-        assert said.startswith(f"warning: sweep.objective={objective}: jobs differ in env.rewards")
+    warning = why_not_comparable(jobs.configs, jobs.settings)
+    assert (warning is not None) == warns
+    if warning:
+        assert warning.startswith(
+            f"warning: sweep.objective={objective}: jobs differ in env.rewards"
+        )
 
 
 def test_a_sweep_says_that_its_jobs_compile_first_unless_all_have_run() -> None:
@@ -354,7 +358,7 @@ def test_jobs_of_one_program_have_the_memory_and_cores_of_their_slots() -> None:
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("algo=a3c", "algo=a3c"),
         ("plan.gmis_per_gpu=2", "plan.gmis_per_gpu=2"),
@@ -366,13 +370,15 @@ def test_jobs_of_one_program_have_the_memory_and_cores_of_their_slots() -> None:
         ("env.randomize=on", "env.randomize=on"),
     ],
 )
-def test_jobs_that_need_processes_of_their_own_are_not_packed(override: str, said: str) -> None:
+def test_jobs_that_need_processes_of_their_own_are_not_packed(override: str, message: str) -> None:
     jobs = jobs_of([compose("seed=0"), compose("seed=1", override)])
     require_packable(SweepConfig(), jobs)
     require_packable(SweepConfig(pack="auto"), jobs)
     assert most_together(SweepConfig(pack="auto"), jobs[1], jobs) == 1
     require_packable(SweepConfig(pack="vmap"), jobs[:1])
-    with pytest.raises(ConfigError, match=f"job 1 has {re.escape(said)}, .* allowed: auto, gmi$"):
+    with pytest.raises(
+        ConfigError, match=f"job 1 has {re.escape(message)}, .* allowed: auto, gmi$"
+    ):
         require_packable(SweepConfig(pack="vmap"), jobs)
 
 
@@ -696,11 +702,11 @@ def test_a_sweep_that_stops_prints_the_whole_command_that_goes_on(tmp_path: Path
 
 @pytest.mark.parametrize("overrides", [(), ("seed=0,1",)])
 def test_a_sweep_without_a_list_says_that_it_is_one_job(overrides: tuple[str, ...]) -> None:
-    work, said = build_sweep(["env=ant", *overrides]), io.StringIO()
+    work, output = build_sweep(["env=ant", *overrides]), io.StringIO()
     here = machine(0)
     site = Site(plan_slots(work.ranking, here, {"auto"}), here)
-    announce(Console(file=said, width=300), [site], work, 0)
-    assert ("one job, because no key has several values" in said.getvalue()) == (not overrides)
+    announce(Console(file=output, width=300), [site], work, 0)
+    assert ("one job, because no key has several values" in output.getvalue()) == (not overrides)
 
 
 def test_the_middle_of_curves_leaves_out_the_outer_quarters() -> None:

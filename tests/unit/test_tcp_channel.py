@@ -113,14 +113,14 @@ def test_nobody_listens_once_the_agent_is_there_and_its_death_is_seen_at_once(
 
 
 @pytest.mark.parametrize("kind", ["quick", "silent", "other job"])
-def test_strangers_before_the_agent_keep_it_out_and_deliver_nothing(
+def test_clients_without_the_secret_neither_deliver_nor_keep_the_agent_out(
     kind: str, address: str
 ) -> None:
     reader = RemoteReader(address, 1, 0, CAPACITY, SECRET)
     with ExitStack() as held:
         for _ in range(1000 if kind == "quick" else 0):
-            with suppress(OSError), socket.create_connection(at(address), 5.0) as stranger:
-                stranger.sendall(b"noise" * 600)
+            with suppress(OSError), socket.create_connection(at(address), 5.0) as client:
+                client.sendall(b"noise" * 600)
         for _ in range(50 if kind == "silent" else 0):
             held.enter_context(socket.create_connection(at(address), 5.0))
         if kind == "other job":
@@ -190,7 +190,7 @@ def test_a_length_that_cannot_be_is_refused_before_memory_is_taken(
         with pytest.raises(CollectiveError, match="GMI 0 sends a message of"):
             reader.try_get()
         with suppress(ConnectionError):
-            while connection.recv(4096):  # It is hung up on.
+            while connection.recv(4096):  # Until the other end closes it.
                 pass
     reader.close()
 

@@ -100,13 +100,13 @@ def test_what_is_no_message_of_registers_is_an_error(
 
 def test_another_secret_gets_and_gives_nothing() -> None:
     with reserved_address("127.0.0.1") as address:
-        stranger, agent = ends(address, os.urandom(32))
-        stranger.own(0).publish(np.array([1, 2]))
+        other, agent = ends(address, os.urandom(32))
+        other.own(0).publish(np.array([1, 2]))
         agent.own(0).publish(np.ones(3))
         time.sleep(0.5)
         assert agent.of(0, 0).read() is None
-        assert stranger.of(7, 0).read() is None
-        for end in (stranger, agent):
+        assert other.of(7, 0).read() is None
+        for end in (other, agent):
             end.close()
 
 
@@ -122,7 +122,7 @@ def test_what_was_published_last_arrives_though_its_process_has_left(
 
 
 @pytest.mark.parametrize("comes", ["before", "after"])
-def test_strangers_change_nothing_of_what_is_published(comes: str) -> None:
+def test_unauthenticated_clients_change_nothing_of_what_is_published(comes: str) -> None:
     """A thousand quick ones, before the leader is there or after."""
     with reserved_address("127.0.0.1") as address, ExitStack() as held:
         agent = RemoteRegisters(
@@ -141,8 +141,8 @@ def test_strangers_change_nothing_of_what_is_published(comes: str) -> None:
 
         leader = lead() if comes == "after" else None
         for _ in range(1000):
-            with suppress(OSError), socket.create_connection(split(address), 5.0) as stranger:
-                stranger.sendall(b"noise" * 600)
+            with suppress(OSError), socket.create_connection(split(address), 5.0) as client:
+                client.sendall(b"noise" * 600)
         leader = leader or lead()
         for number in range(3, 6):
             leader.own(0).publish(np.array([number, 2]))

@@ -57,7 +57,7 @@ def test_a_loss_that_is_not_finite_is_named() -> None:
         report(TrainingLog("point_mass", (), 0), 64, spoilt, {})
 
 
-def test_the_first_overflow_is_told_and_all_are_logged(
+def test_the_first_overflow_is_reported_and_all_are_logged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sink = JsonlSink(tmp_path / "metrics.jsonl")
@@ -65,16 +65,16 @@ def test_the_first_overflow_is_told_and_all_are_logged(
     for iteration, count in enumerate((0, 5, 7), start=1):
         full = dict.fromkeys(OVERFLOWS, 0) | {"contact": count}
         report(log, 64 * iteration, metrics_from(_counts(full)), {})
-    # Where nothing can overflow no line speaks of it.
+    # Where nothing can overflow there is no line about it.
     report(TrainingLog("point_mass", (sink,), 0), 64, metrics_from(_counts()), {})
     sink.close()
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [line.get("physics/contact_overflow_steps") for line in lines] == [0.0, 5.0, 7.0, None]
     assert [line.get("physics/constraint_overflow_steps") for line in lines] == [0, 0, 0, None]
     assert log.overflows.steps == {"contact": 12.0, "constraint": 0.0}
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 1
-    assert told[0].startswith("point_mass: MJX-Warp's contact buffer was too small in 5 ")
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 1
+    assert errors[0].startswith("point_mass: MJX-Warp's contact buffer was too small in 5 ")
 
 
 def test_reports_come_in_order_from_a_thread_of_their_own_and_errors_with_the_next_call() -> None:

@@ -322,7 +322,7 @@ def test_wrappers_of_observations_fit_next_step(wrap: Any, next_step: GmijaxVect
         assert obs.shape == wrapped.observation_space.shape
 
 
-def test_misuse_is_told(envs: GmijaxVectorEnv):
+def test_misuse_is_an_error(envs: GmijaxVectorEnv):
     fresh = made(arrays="jax")
     with pytest.raises(gym.error.ResetNeeded, match="reset"):
         fresh.step(STILL)
@@ -372,7 +372,7 @@ def test_options_that_would_be_ignored_are_refused(
         (4, {}, r"pip install 'gmijax\[gymnasium\]'"),
     ],
 )
-def test_bad_input_or_a_package_that_is_missing_is_told(
+def test_bad_input_or_a_missing_package_is_an_error(
     num_envs: Any, options: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
@@ -388,7 +388,7 @@ def test_bad_input_or_a_package_that_is_missing_is_told(
         ({"api": "rsl_rl"}, "rsl_rl", r"api=rsl_rl: needs rsl-rl-lib \(pip install"),
     ],
 )
-def test_a_library_that_is_missing_is_told(
+def test_a_missing_library_is_an_error(
     options: dict[str, Any], missing: str, message: str, monkeypatch: pytest.MonkeyPatch
 ):
     there = importlib.util.find_spec
@@ -400,12 +400,12 @@ def test_a_library_that_is_missing_is_told(
 
 
 @pytest.mark.parametrize("length", ["5", 2.5])
-def test_a_length_that_is_no_number_is_told(length: Any):
+def test_a_length_that_is_no_number_is_an_error(length: Any):
     with pytest.raises(ConfigError, match=r"env\.episode_length=.*: expected a whole number"):
         make_env("ant", episode_length=length)
 
 
-def test_a_slow_cpu_is_told(monkeypatch: pytest.MonkeyPatch):
+def test_a_slow_cpu_is_reported(monkeypatch: pytest.MonkeyPatch):
     env = point_mass_env(LENGTH)
     monkeypatch.setattr(registry, "missing_on_cpu", lambda *_: {"XLA_FLAGS": "--a=b"})
     with warnings.catch_warnings():

@@ -179,7 +179,7 @@ def test_the_mouse_pulls_a_body_until_it_lets_go() -> None:
     assert stand.qvel()[2] < falling
 
 
-def test_a_command_is_told_to_all_until_it_is_drawn_again() -> None:
+def test_a_command_holds_for_all_until_it_is_drawn_again() -> None:
     stand = Stand("anymal")
     stand.loop.do(requests.SetCommand((1.0, 0.0, -0.5)))
     stand.loop.do(requests.Reset())

@@ -165,7 +165,7 @@ def test_nobody_can_open_a_public_tunnel(
     monkeypatch.setattr(viser._viser, "ViserTunnel", tunnel)
     client.send("ShareUrlRequest")
     client.send("ShareUrlDisconnect")
-    client.click("Push")  # What comes after it is heard after it.
+    client.click("Push")  # What comes after it is handled after it.
     shown.next(requests.Push)
     executor = shown.server._thread_executor
     executor.submit(lambda: None).result(WAIT_S)
@@ -262,7 +262,7 @@ def test_a_taken_port_is_not_waited_for(shown: Shown) -> None:
 @pytest.mark.parametrize(
     "host", ["256.1.1.1", "no.such.host.invalid", "\0", "é" * 300, "", "8.8.8.8"]
 )
-def test_where_nothing_can_listen_is_said(host: str) -> None:
+def test_an_address_where_nothing_can_listen_is_named(host: str) -> None:
     with pytest.raises(ConfigError, match=r"view\.host="):
         open_server(Guard(host), 0)
 

@@ -21,34 +21,34 @@ FAKE = """
 import json, os
 class Run:
     def __init__(self, id): self.id, self.summary = id, {}
-    def log(self, values, step): tell("log", step=step, values=values)
-    def finish(self, exit_code): tell("finish", exit_code=exit_code, summary=self.summary)
-def tell(what, **said):
+    def log(self, values, step): record("log", step=step, values=values)
+    def finish(self, exit_code): record("finish", exit_code=exit_code, summary=self.summary)
+def record(what, **fields):
     with open(os.environ["FAKE_LOG"], "a") as file:
-        file.write(json.dumps({"what": what, **said}) + "\\n")
-def Settings(**said):
-    return said
+        file.write(json.dumps({"what": what, **fields}) + "\\n")
+def Settings(**fields):
+    return fields
 def Video(path, caption, format):
     return {"film": os.path.basename(path), "caption": caption, "format": format}
-def init(*, id, dir, **said):
+def init(*, id, dir, **fields):
     if os.environ.get("FAKE_FAILS"):
         raise RuntimeError("no\\nnetwork")
-    tell("init", id=id, **said)
+    record("init", id=id, **fields)
     return Run(id)
 """
 
 
 @pytest.fixture
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """What a fake wandb is told, one JSON object a line."""
+    """The file with the calls of a fake wandb, one JSON object a line."""
     (tmp_path / "wandb.py").write_text(FAKE)
     path = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
     monkeypatch.setenv("PYTHONPATH", path)
-    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "told.jsonl"))
-    return tmp_path / "told.jsonl"
+    monkeypatch.setenv("FAKE_LOG", str(tmp_path / "calls.jsonl"))
+    return tmp_path / "calls.jsonl"
 
 
-def told(path: Path) -> list[dict[str, Any]]:
+def calls_of(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
@@ -69,14 +69,14 @@ def follow(
     checkpoint: Path | None = None,
     summary: Mapping[str, Any] | None = None,
 ) -> list[str]:
-    """A run with a line of metrics at each of `steps`; returns what the user is told."""
-    said: list[str] = []
-    with followed(config, run, checkpoint, said.append):
+    """A run with a line of metrics at each of `steps`; returns the messages to the user."""
+    messages: list[str] = []
+    with followed(config, run, checkpoint, messages.append):
         for env_steps in steps:
             line(run, env_steps=env_steps, **{"return": None, "loss/policy": env_steps / 2})
         if summary:
             write_json(run.summary, summary)
-    return said
+    return messages
 
 
 def test_lines_configuration_and_summary_are_sent(tmp_path: Path, fake: Path):
@@ -85,7 +85,7 @@ def test_lines_configuration_and_summary_are_sent(tmp_path: Path, fake: Path):
     run.video(64).touch()
     config = compose("wandb.mode=online", "wandb.project=p", "wandb.group=g", "seed=7")
     assert follow(run, config, (64, 128), summary={"status": "completed", "x": 1}) == []
-    begin, *logged, end = told(fake)
+    begin, *logged, end = calls_of(fake)
     assert begin["config"]["seed"] == 7
     assert (begin["project"], begin["group"], begin["name"]) == ("p", "g", "run")
     assert begin["settings"]["mode"] == "online"
@@ -106,17 +106,17 @@ def test_a_resumed_run_goes_on_under_the_same_id(tmp_path: Path, fake: Path):
     first, second = a_run(tmp_path / "first"), a_run(tmp_path / "second")
     follow(first, config, (64, 128))
     assert follow(second, config, (64, 128, 192), first.checkpoint(128)) == []
-    begins = [line for line in told(fake) if line["what"] == "init"]
+    begins = [line for line in calls_of(fake) if line["what"] == "init"]
     assert begins[0]["id"] == begins[1]["id"]
-    assert [line["step"] for line in told(fake) if line["what"] == "log"] == [64, 128, 192]
+    assert [line["step"] for line in calls_of(fake) if line["what"] == "log"] == [64, 128, 192]
 
 
 def test_what_fails_is_one_line_and_no_error(
     tmp_path: Path, fake: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("FAKE_FAILS", "1")
-    said = follow(a_run(tmp_path / "run"), compose("wandb.mode=online"), (64,))
-    assert said == ["Weights & Biases: nothing more is sent: RuntimeError: no network"]
+    messages = follow(a_run(tmp_path / "run"), compose("wandb.mode=online"), (64,))
+    assert messages == ["Weights & Biases: nothing more is sent: RuntimeError: no network"]
     assert not fake.exists()
 
 

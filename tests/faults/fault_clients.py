@@ -1,4 +1,7 @@
-"""Strangers at the ports of a job on two nodes: slow ones, silent ones, many, with any bytes."""
+"""Unauthenticated clients at the ports of a job on two nodes: slow, silent, many, with any bytes.
+
+Their kinds and their group are `strangers` in files of results.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ _WAYS: dict[str, tuple[bytes, float]] = {
     "silence": (b"", 3.0),
     "half a message": (b"\0", 30.0),
 }
-"""What a stranger sends, and how long it stays."""
+"""What a client sends, and how long it stays."""
 
 
 @cache
@@ -44,15 +47,15 @@ def can_cluster() -> bool:
     return importlib.util.find_spec("ray") is not None
 
 
-def run_strangers(kind: str, seed: int, scratch: Path) -> Report:
-    """Strangers from the first port on; the job must start, train, and end when it is asked to."""
+def run_with_clients(kind: str, seed: int, scratch: Path) -> Report:
+    """Clients from the first port on; the job must start, train, and end when it is asked to."""
     wrong: list[str] = []
     scratch.mkdir(parents=True, exist_ok=True)
     write_tasks(scratch)
     (scratch / "tmp").mkdir()
     try:
         with two_nodes(scratch / "ray.txt") as cluster:
-            wrong = _Visited(kind, seed, scratch, cluster.address).run()
+            wrong = _DisturbedJob(kind, seed, scratch, cluster.address).run()
     except Exception as error:
         wrong = [f"{type(error).__name__}: {error}"]
     left = processes_of(scratch)
@@ -60,7 +63,7 @@ def run_strangers(kind: str, seed: int, scratch: Path) -> Report:
     return Report.of(kind, seed, [*wrong, *(f"leaked: {process}" for process in left)])
 
 
-class _Visited:
+class _DisturbedJob:
     def __init__(self, kind: str, seed: int, scratch: Path, address: str) -> None:
         self._draw = random.Random(seed)
         self._run = scratch / "run"
@@ -107,7 +110,7 @@ class _Visited:
         assert self._job.poll() is None, self._log.read_text()[-600:]
 
     def _visit_all(self) -> None:
-        """Strangers of every kind at every port, from the moment that it is there."""
+        """Clients of every kind at every port, from the moment that it is there."""
         while not self._is_over.wait(0.05):
             for port in _ports(pids_of(self._run)) - self._visited:
                 self._visited.add(port)
@@ -120,8 +123,8 @@ class _Visited:
     def _visit(self, port: int, data: bytes, stay_s: float, draw: random.Random) -> None:
         while not self._is_over.is_set():
             try:
-                with socket.create_connection(("127.0.0.1", port), 2.0) as stranger:
-                    stranger.sendall(data or draw.randbytes(draw.randrange(1, 3000)))
+                with socket.create_connection(("127.0.0.1", port), 2.0) as client:
+                    client.sendall(data or draw.randbytes(draw.randrange(1, 3000)))
                     self._is_over.wait(stay_s)
             except OSError:
                 self._is_over.wait(0.2)
