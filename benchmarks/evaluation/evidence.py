@@ -102,4 +102,6 @@ def together(parts: Iterable[Evidence]) -> Evidence | None:
     if not found:
         return None
     sources = frozenset[Source]().union(*(one.sources for one in found))
-    return Evidence(min(one.repeats for one in found), sources)
+    units = {one.unit for one in found}
+    unit = units.pop() if len(units) == 1 else "run"
+    return Evidence(min(one.repeats for one in found), sources, unit)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from benchmarks.evaluation import check, figures
-from benchmarks.evaluation.evidence import Evidence, Source
+from benchmarks.evaluation.evidence import Evidence, Source, together
 from benchmarks.evaluation.figures import rate, ratio, text_of, text_of_range
 from benchmarks.evaluation.finding import Finding
 from benchmarks.evaluation.planned import unplanned, without_commit
@@ -68,6 +68,12 @@ def test_a_ratio_is_of_as_many_runs_as_the_fewer_of_both():
     both = text_of_range([rate("new", "thrice"), rate("old", "thrice")])
     assert str(both.evidence) == "H200, 3 runs, commit unknown"
     assert text_of(rate("none", "thrice")).evidence is None
+
+
+@pytest.mark.parametrize(("unit", "text"), [("kill", "CPU, 3 kills"), ("run", "CPU, 3 runs")])
+def test_figures_of_one_unit_keep_it_together(unit: str, text: str):
+    kills = Evidence(17, frozenset([NEW]), "kill")
+    assert str(together([kills, Evidence(3, frozenset([OTHER]), unit)])) == text
 
 
 @pytest.mark.parametrize(
