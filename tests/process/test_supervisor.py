@@ -147,7 +147,7 @@ def start_compiler(run: RunPaths) -> subprocess.Popen[str]:
         (
             ["raise_value_error", "ignore_stop"],
             {},
-            r"GMI 0 failed: exit code 1: ValueError: the sum is off$",
+            r"GMI 0 failed: exit code 1: ValueError: the sum is off; by one$",
         ),
         # A GMI that lost its peer does not hide the peer.
         (
