@@ -124,7 +124,9 @@ class Role(ABC):
         """The mean or the sum of `data` over GMIs, bit-identical on all of them.
 
         Every GMI of the group makes the same calls in the same order, with data of the same
-        nesting, shapes and dtypes.
+        nesting, shapes and dtypes. Only the operation, the dtypes and how many numbers there are
+        of each are compared: numbers of another nesting or shape, but as many, are combined in
+        their order.
 
         Args:
           data: dicts, lists, tuples, NamedTuples, dataclasses with arrays of numpy or jax and
@@ -138,7 +140,7 @@ class Role(ABC):
         Raises:
           PeerLost: the process of a GMI of the group is gone.
           CollectiveTimeout: a GMI did not come in time; names it.
-          CollectiveError: GMIs came with different data.
+          CollectiveError: GMIs came with another operation, or other numbers of values.
         """
         return here("collective").reduce(data, op, group)
 
