@@ -97,7 +97,8 @@ def _channel_designs(task: str) -> tuple[Case, ...]:
 def _lgr(task: str) -> tuple[Case, ...]:
     """Cells of the paper's table of LGR: so many GPUs with so many trainers each.
 
-    Gradients through host memory, by what Algorithm 1 takes, and in GPU memory as jobs do here.
+    Gradients through host memory (`mpr`), and in GPU memory by what Algorithm 1 takes and by
+    `one_shot`.
     """
     return tuple(
         _case(
