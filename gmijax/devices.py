@@ -20,8 +20,8 @@ PEAKS_BESIDE_JAX: list[Callable[[], int]] = []
 def start_device() -> None:
     """Starts this process's device in a thread of its own, while the caller imports.
 
-    CUDA spends a second or more in its driver. Whoever uses the device first waits for the rest,
-    and gets the error if there is one.
+    CUDA spends a second or more in its driver. The first call that uses the device waits for the
+    rest, and gets the error if there is one.
     """
 
     def start() -> None:

@@ -132,6 +132,7 @@ FAULTS = MappingProxyType(
         "kill": "`kill -9` of a GMI",
     }
 )
+"""Kind of a fault in the file -> what happens."""
 
 
 @table("faults", "fault | seconds until all GMIs train again:", "faults-h200")

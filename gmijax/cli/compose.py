@@ -39,7 +39,7 @@ from gmijax.runs.saved_config import (
 )
 from gmijax.sim.registry import SUITES
 from gmijax.sim.robots import robot_name
-from gmijax.sim.source import names_file, no_reference, reference
+from gmijax.sim.source import names_file, reference, split
 
 C = TypeVar("C")
 
@@ -233,7 +233,7 @@ def _check_override(name: str, item: Override) -> None:
         if key == "env" and colon and suite in options:  # As labels and run folders have it.
             hint = f": did you mean env={suite} env.name={of_suite}?"
         elif key == "env" and names_file(str(item.value())):
-            raise no_reference(str(item.value()))
+            split(str(item.value()))
         raise ConfigError(
             f"{key}={item.value()}: unknown{kind}{hint or suggestion(str(item.value()), options)}"
         )

@@ -84,7 +84,7 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     kinds = {".onnx": _from_onnx, ".stablehlo": _from_stablehlo}
     kind = kinds.get(os.path.splitext(text)[1])
     if kind is None:
-        _require_no_file(text)
+        _require_run_folder(text)
         checkpoint, passed_over = choose_checkpoint(text, "path")
         for line in passed_over:
             warnings.warn(line, RuntimeWarning, stacklevel=2)
@@ -94,7 +94,7 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     return kind(Path(text))
 
 
-def _require_no_file(path: str) -> None:
+def _require_run_folder(path: str) -> None:
     """Names the file that the folder of an export stands for, or what may be given."""
     exported = ExportPaths(Path(path))
     for file in (exported.onnx, exported.stablehlo):

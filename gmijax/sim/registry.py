@@ -64,11 +64,9 @@ def require_task(name: str, suite: str = "gmijax") -> None:
             f"env={choice_of(suite, name)}: needs the package {package} "
             f"(pip install 'gmijax[{suite}]')"
         )
-    if suite == "custom":
+    if suite == "custom" or (suite == "gmijax" and source.names_file(name)):
         source.split(name)
     if suite == "gmijax" and name not in TASKS:
-        if source.names_file(name):
-            raise source.no_reference(name)
         raise ConfigError(f"env={name}: unknown task{suggestion(name, (*TASKS, *ROBOTS))}")
 
 

@@ -28,15 +28,10 @@ def split(name: str) -> tuple[Path, str]:
     """
     path, colon, function = name.rpartition(":")
     if not (colon and path.endswith(".py") and function.isidentifier()):
-        raise no_reference(name)
+        raise ConfigError(f"env={name}: expected PATH.py:FUNCTION, e.g. path/to/cart.py:make")
     if not os.path.isfile(path):  # Unlike `Path.is_file` it takes any text.
         raise ConfigError(f"env={nearby(Path(name))}: no such file")
     return Path(path).resolve(), function
-
-
-def no_reference(name: str) -> ConfigError:
-    """What to raise for a name that is meant as `PATH.py:FUNCTION`, and is none."""
-    return ConfigError(f"env={name}: expected PATH.py:FUNCTION, e.g. path/to/cart.py:make")
 
 
 def names_file(name: str) -> bool:

@@ -42,7 +42,7 @@ def describe_exit(
     gmi: int, exit_code: int, error: ReportedError | None, stderr: Path, iteration: int = 0
 ) -> GmiFailed:
     """Puts together what the GMI left behind: its own error, else its last line on stderr."""
-    own = with_type(error.type, first_line(error.message)) if error else last_line(stderr)
+    own = with_type(error.type, shown_gist(error.message)) if error else last_line(stderr)
     how = f"exit code {exit_code}" if exit_code >= 0 else f"ended by {signal_name(-exit_code)}"
     if _NOTHING_FITS in own:
         own += " (perhaps there is too little GPU memory: fewer environments need less)"
@@ -139,6 +139,6 @@ def last_lines(path: Path, num_bytes: int = _TAIL_BYTES, begins: int = 0) -> lis
     return [printable(line) for line in text.splitlines()]
 
 
-def first_line(text: str, most: int | None = _MAX_LINE) -> str:
+def shown_gist(text: str, most: int | None = _MAX_LINE) -> str:
     """The gist of a text as it may be shown, shortened to `most` characters."""
     return printable(gist_of(text))[:most]

@@ -18,8 +18,8 @@ from gmijax.supervise.failures import (
     describe_exit,
     ended_with,
     first_cause,
-    first_line,
     is_consequence,
+    shown_gist,
 )
 from gmijax.supervise.start_gmi import Launch, StartGmi, start_gmi
 from gmijax.supervise.stop_signals import StopSignals
@@ -146,7 +146,7 @@ class Supervisor:
             raise GmiFailed(stuck.gmi, what, iteration=iteration)
         if cause.error is not None and ended_with(cause, ConfigError):
             # Bad input stays bad input; its line ends with the location.
-            raise ConfigError(first_line(cause.error.message, None))
+            raise ConfigError(shown_gist(cause.error.message, None))
         raise cause
 
     def _poll_failures(self) -> list[GmiFailed]:

@@ -121,8 +121,8 @@ class IpcBuffers:
     def _write(self, queue: CudaQueue, stream: int, source: int, num_bytes: int) -> None:
         """Queues a write of this rank's slots, and a wait for all other members' writes.
 
-        For all of them: whoever writes a slot again must know that all have read the other one.
-        So a rank raises its flag also if it has nothing to write.
+        For all of them: a rank that writes a slot again must know that all have read the other
+        one. So a rank raises its flag also if it has nothing to write.
         """
         self._num_writes += 1
         count = self._num_writes & 0xFFFFFFFF
